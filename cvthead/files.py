@@ -1,0 +1,75 @@
+"""Output that appears whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from cvthead.errors import InputError
+
+
+@contextmanager
+def atomic_path(path: Path | str, *, folder: bool = False) -> Iterator[Path]:
+    """A temporary sibling of ``path``, renamed to it when the block succeeds.
+
+    Whatever ends the block early (also KeyboardInterrupt) removes the temporary file, and a
+    file that was already at ``path`` stays as it was. Errors of the block pass unchanged.
+
+    Args:
+        path: the file, or with ``folder`` the folder, to write.
+        folder: yield a new empty folder instead of the name of a file to create.
+
+    Raises:
+        InputError: the parent folder does not exist, ``path`` is a folder (with ``folder``: a
+            file or a folder that is not empty), or the operating system refuses.
+    """
+    target = Path(path)
+    if not target.parent.is_dir():
+        raise InputError(
+            f"{target.parent} is not a folder", hint="Create the output's folder first."
+        )
+    empty = target.is_dir() and not any(target.iterdir())
+    if (folder and target.exists() and not empty) or (not folder and target.is_dir()):
+        raise InputError(f"{target} is already there", hint="Choose another name.")
+    # A sibling is on the same file system, so that the rename is atomic.
+    temporary = target.with_name(f".{target.name[:100]}.{secrets.token_hex(4)}.part")
+    try:
+        if folder:
+            with write_errors(target):
+                temporary.mkdir()
+        yield temporary
+        with write_errors(target):
+            if folder and target.is_dir():
+                target.rmdir()
+            os.replace(temporary, target)
+    finally:
+        if temporary.is_dir():
+            shutil.rmtree(temporary, ignore_errors=True)
+        else:
+            temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def write_errors(target: Path | str) -> Iterator[None]:
+    """Turns what the operating system refuses (no space, no permission) into InputError."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(
+            f"cannot write {target}: {error.strerror or error}",
+            hint="Check the folder's permissions and the free space.",
+        ) from error
+
+
+def write_file(path: Path | str, data: bytes) -> None:
+    """Write ``data`` to ``path`` atomically.
+
+    Raises:
+        InputError: see ``atomic_path``.
+    """
+    with atomic_path(path) as temporary, write_errors(path):
+        temporary.write_bytes(data)

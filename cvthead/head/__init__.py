@@ -1,0 +1,1 @@
+"""The parametric head: geometry, mesh hierarchy and ARKit units."""

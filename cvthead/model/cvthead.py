@@ -1,0 +1,105 @@
+"""The open preset of CVTHead: source -> descriptors (once), descriptors -> frame (each)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from cvthead.head.hierarchy import MeshHierarchy
+from cvthead.model.config import ModelConfig
+from cvthead.model.light_unet import LightUNet
+from cvthead.model.pixel_aligned import PixelAlignedFusion
+from cvthead.model.positional import image_code, vertex_code
+from cvthead.model.pyramid_encoder import PyramidEncoder
+from cvthead.model.spiral import SpiralUpsampler
+from cvthead.model.splat import splat
+from cvthead.model.transformer import Transformer
+from cvthead.points import PointLayout
+
+
+class CVTHead(nn.Module):
+    """Vertex-feature transformer and neural point renderer (paper section 3).
+
+    :meth:`describe` depends on the source only, :meth:`paint` on the driven points only: the
+    caller keeps the descriptors and pays :meth:`paint` per frame.
+    """
+
+    coarse: Tensor  # (coarse vertices,) their numbers on the full mesh
+    edges: Tensor  # (midpoints, 2)
+    mirror: Tensor  # (vertices + midpoints,)
+    image_code: Tensor  # (tokens, token_size)
+
+    def __init__(
+        self, config: ModelConfig, hierarchy: MeshHierarchy, layout: PointLayout
+    ) -> None:
+        super().__init__()
+        self.config = config
+        size = config.token_size
+        coarse = torch.from_numpy(hierarchy.down[0]).long()
+        for down in hierarchy.down[1:]:
+            coarse = coarse[torch.from_numpy(down).long()]
+        for name, value in {
+            "coarse": coarse,
+            "edges": torch.from_numpy(layout.edges).long(),
+            "mirror": torch.from_numpy(layout.mirror).long(),
+            "image_code": image_code(config.token_grid, size),
+        }.items():
+            self.register_buffer(name, value, persistent=False)
+        self.encoder = PyramidEncoder(size, config.pixel_aligned_size)
+        self.vertex_query = nn.Parameter(torch.randn(len(coarse), size) * 0.02)
+        self.transformer = Transformer(size, config.depth, config.heads, config.mlp_size)
+        self.upsampler = SpiralUpsampler(hierarchy, size, config.upsampler_sizes)
+        self.fusion = PixelAlignedFusion(
+            layout.vertices,
+            config.upsampler_sizes[-1],
+            config.pixel_aligned_size,
+            config.point_embedding_size,
+            config.descriptor_size,
+        )
+        self.unet = LightUNet(1 + config.descriptor_size, config.unet_sizes, config.unet_unshuffle)
+
+    def describe(self, source: Tensor, points: Tensor, visible: Tensor, anchor: Tensor) -> Tensor:
+        """Point descriptors of a source image (paper section 3.3).
+
+        Args:
+            source: (b, 4, 256, 256), RGB in [-1, 1] with 0 outside the person, and the mask.
+            points: (b, p, 3) normalised source projections: vertices, midpoints, shell.
+            visible: (b, p) 1 where the source sees the point.
+            anchor: (b, shell) vertex that each shell point hangs on.
+
+        Returns:
+            (b, p, C) float32.
+        """
+        tokens, pixels = self.encoder(source)
+        query = self.vertex_query + vertex_code(points[:, self.coarse], self.config.token_size)
+        x = torch.cat([query, tokens.float() + self.image_code], dim=1)
+        x = self.transformer(x)[:, : len(self.coarse)]
+        vertex = self.upsampler(x)  # b n f
+        embedding = self.fusion.vertex_embedding.expand(len(source), -1, -1)
+        feature = self._spread(vertex, anchor)
+        embedding = self._spread(embedding, anchor)
+        embedding[:, -anchor.shape[1] :] += self.fusion.shell_embedding
+        shell = torch.arange(len(self.mirror), points.shape[1], device=self.mirror.device)
+        mirror = torch.cat([self.mirror, shell])
+        return self.fusion(feature, embedding, pixels.float(), source, points, visible, mirror)
+
+    def _spread(self, vertex: Tensor, anchor: Tensor) -> Tensor:
+        """(b, n, c) vertex values -> (b, p, c) at vertices, edge midpoints and shell points."""
+        middle = (vertex[:, self.edges[:, 0]] + vertex[:, self.edges[:, 1]]) / 2
+        shell = vertex.gather(1, anchor[..., None].expand(-1, -1, vertex.shape[-1]))
+        return torch.cat([vertex, middle, shell], dim=1)
+
+    def paint(self, points: Tensor, descriptors: Tensor, size: int) -> tuple[Tensor, Tensor]:
+        """Neural vertex rendering (paper section 3.4).
+
+        Args:
+            points: (b, p, 3) normalised driven projections.
+            descriptors: (b, p, C).
+            size: output height and width, a multiple of 16.
+
+        Returns:
+            RGB (b, 3, size, size) in [-1, 1] and mask logits (b, 1, size, size).
+        """
+        image = splat(points, descriptors, size)
+        out = self.unet(image.contiguous(memory_format=torch.channels_last)).float()
+        return torch.tanh(out[:, :3]), out[:, 3:]

@@ -1,0 +1,71 @@
+"""The points that are splatted: mesh vertices, edge midpoints where detail is, shell points.
+
+A face vertex every 5 mm is four pixels of a 256 x 256 frame, too coarse for eyes and lips. So
+the midpoint of every edge of face, eyes and mouth is a point of its own: it costs no head-model
+work, since it is the mean of two posed vertices, but gets its own descriptor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cvthead.head.model import HeadModel, Region
+
+DETAIL_REGIONS = (Region.FACE, Region.EYES, Region.MOUTH)
+SHELL_POINTS = 512
+FAR_AWAY = np.array([-10.0, -10.0, 50.0], dtype=np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class PointLayout:
+    """Numbering of the points: vertices, then midpoints, then shell points.
+
+    Attributes:
+        vertices: N, mesh vertices.
+        edges: (D, 2) end vertices of each midpoint.
+        mirror: (N + D,) the mirrored counterpart of each point.
+    """
+
+    vertices: int
+    edges: NDArray[np.int32]
+    mirror: NDArray[np.int32]
+
+    @classmethod
+    def of(cls, head: HeadModel) -> PointLayout:
+        detail = np.isin(head.region, DETAIL_REGIONS)
+        sides = np.concatenate([head.faces[:, [0, 1]], head.faces[:, [1, 2]], head.faces[:, [2, 0]]])
+        sides = sides[detail[sides].all(1)]
+        edges = np.unique(np.sort(sides, axis=1), axis=0)
+        flipped = np.sort(head.mirror[edges], axis=1)
+        number = {tuple(edge): i for i, edge in enumerate(edges.tolist())}
+        # The mesh's diagonals need not be mirrored; such an edge answers for itself.
+        twin = [number.get(tuple(edge), i) for i, edge in enumerate(flipped.tolist())]
+        count = len(head.template)
+        mirror = np.concatenate([head.mirror, np.asarray(twin) + count])
+        return cls(count, edges.astype(np.int32), mirror.astype(np.int32))
+
+    @property
+    def surface(self) -> int:
+        """Points on the mesh: N + D."""
+        return self.vertices + len(self.edges)
+
+    @property
+    def total(self) -> int:
+        """All points, shell included: N + D + SHELL_POINTS."""
+        return self.surface + SHELL_POINTS
+
+    def arrange(self, points: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(N + K, 3) projected vertices and shell points -> (total, 3), unused shell far away."""
+        vertices = points[: self.vertices]
+        shell = points[self.vertices :]
+        out = np.empty((self.total, 3), dtype=np.float32)
+        out[: self.vertices] = vertices
+        out[self.vertices : self.surface] = (
+            vertices[self.edges[:, 0]] + vertices[self.edges[:, 1]]
+        ) * np.float32(0.5)
+        out[self.surface : self.surface + len(shell)] = shell
+        out[self.surface + len(shell) :] = FAR_AWAY
+        return out

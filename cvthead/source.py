@@ -1,0 +1,117 @@
+"""Everything that is read from a source portrait before the network sees it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cvthead.camera import Camera, Crop
+from cvthead.coefficients import Coefficients
+from cvthead.crop import head_crop
+from cvthead.deformation import Deformation, DeformationModel, points, to_pixels
+from cvthead.head.model import HeadModel, Region
+from cvthead.points import PointLayout
+from cvthead.silhouette import person_mask
+from cvthead.tracking.tracker import TrackedFace, Tracker
+from cvthead.visibility import eroded, visible_points
+
+Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class HeadCrop:
+    """A tracked head cut out of its image.
+
+    Attributes:
+        image: (256, 256, 3) uint8 RGB, border replicated beyond the picture.
+        mask: (256, 256) float32 person mask 0..1, 0 beyond the picture.
+        valid: (256, 256) bool, False beyond the picture.
+        crop: where it lies in the image.
+        camera: weak perspective in the crop's normalised coordinates.
+        coefficients: of the tracked head.
+    """
+
+    image: NDArray[np.uint8]
+    mask: Array
+    valid: NDArray[np.bool_]
+    crop: Crop
+    camera: Camera
+    coefficients: Coefficients
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """A head crop with hair and shoulders fitted: the input of the descriptor network.
+
+    Attributes:
+        head: the crop.
+        deformation: hair and shoulders in rest space.
+        points: (P, 3) normalised projections, numbered by the PointLayout.
+        visible: (P,) bool, which of them the portrait sees.
+    """
+
+    head: HeadCrop
+    deformation: Deformation
+    points: Array
+    visible: NDArray[np.bool_]
+
+    @property
+    def network_input(self) -> Array:
+        """(4, 256, 256): RGB in [-1, 1], 0 outside the person, and the mask."""
+        return network_input(self.head.image, self.head.mask)
+
+
+def network_input(image: NDArray[np.uint8], mask: Array) -> Array:
+    """RGB (S, S, 3) uint8 and mask (S, S) -> (4, S, S) float32 for the encoder."""
+    rgb = image.astype(np.float32).transpose(2, 0, 1) * np.float32(2 / 255) - 1
+    return np.concatenate([rgb * mask, mask[None]])
+
+
+def cut_head(tracker: Tracker, image: NDArray[np.uint8], face: TrackedFace) -> HeadCrop:
+    """Crop, mask and camera of a tracked face."""
+    crop = head_crop(tracker.head, face.coefficients, face.camera)
+    pixels, valid = crop.cut(image)
+    probability = tracker.networks.person_mask(pixels)
+    camera = face.camera.in_crop(crop)
+    vertices = tracker.head.vertices(face.coefficients)[tracker.head.region == Region.FACE]
+    kept = person_mask(probability, valid, to_pixels(camera.project(vertices)))
+    mask = np.where(kept | (probability < 0.5), probability, 0) * valid
+    return HeadCrop(
+        pixels, mask.astype(np.float32), valid, crop, camera, face.coefficients
+    )
+
+
+def driven_points(
+    head: HeadModel,
+    layout: PointLayout,
+    coefficients: Coefficients,
+    deformation: Deformation,
+    camera: Camera,
+) -> Array:
+    """Posed, deformed and projected points (P, 3) in normalised coordinates."""
+    return layout.arrange(camera.project(points(head, coefficients, deformation)))
+
+
+def read_source(
+    deformer: DeformationModel, layout: PointLayout, head: HeadCrop, *, deform: bool = True
+) -> Source:
+    """Fit hair and shoulders to the crop and find what it shows.
+
+    Args:
+        deformer: of the tracker's head model.
+        layout: point numbering of the same head model.
+        head: the crop.
+        deform: False leaves the head bald: the ablation without deformation.
+    """
+    model = deformer.head
+    if deform:
+        person = head.mask > 0.5
+        deformation = deformer.fit(head.coefficients, head.camera, person, head.valid)
+    else:
+        deformation = Deformation.none(model)
+    projected = driven_points(model, layout, head.coefficients, deformation, head.camera)
+    mask = eroded(head.mask, 1)
+    visible = visible_points(layout, model.faces, projected, mask, head.camera.scale)
+    return Source(head, deformation, projected, visible)

@@ -1,0 +1,177 @@
+"""Training samples: one source, a few driven views of the same person.
+
+A clip's views are other frames of it. A still's views are itself and its mirror image: the
+mirrored face, seen from the other side, is what the hidden half should look like.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from cvthead.head.model import HeadModel
+from cvthead.points import SHELL_POINTS, PointLayout
+from cvthead.source import driven_points, network_input
+from cvthead.training.records import Frame, Record
+
+Array = NDArray[np.float32]
+
+VIEWS = 2
+CLIP_SHARE = 0.5
+ZOOM, SHIFT = 0.07, 0.04  # jitter of the source crop, relative to its size
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A driven view: image (S, S, 3) 0..1, mask, valid (S, S) and points (P, 3)."""
+
+    image: Array
+    mask: Array
+    valid: Array
+    points: Array
+
+
+class PairDataset(Dataset[dict[str, Tensor]]):
+    """Sample ``i`` depends on ``seed`` and ``i`` alone, so a run resumes exactly."""
+
+    def __init__(
+        self, folder: Path, head: HeadModel, layout: PointLayout, *, size: int, seed: int, samples: int
+    ) -> None:
+        self.head, self.layout = head, layout
+        self.size, self.seed, self.samples = size, seed, samples
+        self.clips: list[Path] = []
+        self.stills: list[Path] = []
+        for path in sorted(folder.glob("*.npz")):
+            with np.load(path, allow_pickle=False) as archive:
+                (self.clips if len(archive["pose"]) > 1 else self.stills).append(path)
+        if not self.clips and not self.stills:
+            raise FileNotFoundError(f"no records in {folder}; run cvthead.training.prepare first")
+
+    def __len__(self) -> int:
+        return self.samples
+
+    def __getitem__(self, index: int) -> dict[str, Tensor]:
+        cv2.setNumThreads(1)
+        rng = np.random.default_rng((self.seed, index))
+        use_clip = bool(self.clips) and (not self.stills or rng.random() < CLIP_SHARE)
+        files: Sequence[Path] = self.clips if use_clip else self.stills
+        record = Record.open(files[rng.integers(len(files))])
+        number = int(rng.choice(record.sources))
+        source = record.frame(number)
+        deformation = record.deformation(number)
+        visible = record.visible(number, self.layout.total).astype(np.float32)
+        anchor = np.zeros(SHELL_POINTS, dtype=np.int64)
+        anchor[: len(deformation.shell_anchor)] = deformation.shell_anchor
+
+        def points(frame: Frame) -> Array:
+            posed = replace(frame.coefficients, shape=source.coefficients.shape)
+            return driven_points(self.head, self.layout, posed, deformation, frame.camera)
+
+        own = points(source)
+        if record.frames > 1:
+            views = []
+            for other in rng.integers(record.frames, size=VIEWS):
+                frame = record.frame(int(other))
+                views.append(View(frame.image / np.float32(255), frame.mask, frame.valid * np.float32(1), points(frame)))
+        else:
+            view = View(source.image / np.float32(255), source.mask, source.valid * np.float32(1), own)
+            views = [view, mirrored(view, self.layout)]
+        colours = colour_jitter(rng)
+        image, mask, own = jittered(rng, source, own)
+        image = np.round(np.clip(colours(image / np.float32(255)), 0, 1) * 255).astype(np.uint8)
+        views = [replace(v, image=np.clip(colours(v.image), 0, 1)) for v in views]
+        network = network_input(image, mask)
+        inside = (np.abs(own[:, :2]) < 1).all(axis=1)
+        visible *= inside
+        if rng.random() < 0.5:  # the whole sample seen in a mirror
+            network = network[:, :, ::-1]
+            own, visible = flip_points(own, self.layout), flip_order(visible, self.layout)
+            anchor = self.head.mirror[anchor].astype(np.int64)
+            views = [mirrored(v, self.layout) for v in views]
+        stack = {
+            "source": network,
+            "points": own,
+            "visible": visible,
+            "anchor": anchor,
+            "background": np.full((VIEWS, 3, 1, 1), 1, np.float32) * rng.random((1, 3, 1, 1)),
+            "image": np.stack([self._resized(v.image).transpose(2, 0, 1) for v in views]),
+            "mask": np.stack([self._resized(v.mask)[None] for v in views]),
+            "valid": np.stack([(self._resized(v.valid)[None] > 0.99) for v in views]),
+            "driven": np.stack([v.points for v in views]),
+        }
+        return {
+            name: torch.from_numpy(
+                np.ascontiguousarray(value if name == "anchor" else value.astype(np.float32))
+            )
+            for name, value in stack.items()
+        }
+
+    def _resized(self, image: Array) -> Array:
+        if image.shape[0] == self.size:
+            return image
+        return cv2.resize(image, (self.size, self.size), interpolation=cv2.INTER_AREA).astype(np.float32)
+
+
+def flip_order(values: NDArray[np.float32], layout: PointLayout) -> Array:
+    """Each surface point takes the value of its mirrored counterpart; shell points their own."""
+    out = values.copy()
+    out[: layout.surface] = values[layout.mirror]
+    return out
+
+
+def flip_points(points: Array, layout: PointLayout) -> Array:
+    """Projections of the head seen in a mirror."""
+    return flip_order(points, layout) * np.array([-1, 1, 1], np.float32)
+
+
+def mirrored(view: View, layout: PointLayout) -> View:
+    return View(
+        view.image[:, ::-1], view.mask[:, ::-1], view.valid[:, ::-1], flip_points(view.points, layout)
+    )
+
+
+def jittered(
+    rng: np.random.Generator, source: Frame, points: Array
+) -> tuple[NDArray[np.uint8], Array, Array]:
+    """The source crop slightly zoomed and shifted: image, mask and points."""
+    size = source.image.shape[0]
+    zoom = float(rng.uniform(1 - ZOOM, 1 + ZOOM))
+    shift = rng.uniform(-SHIFT, SHIFT, 2)
+    centre = (size - 1) / 2
+    offset = centre - zoom * centre + shift * size / 2
+    matrix = np.array([[zoom, 0, offset[0]], [0, zoom, offset[1]]])
+    image = cv2.warpAffine(source.image, matrix, (size, size), borderMode=cv2.BORDER_REPLICATE)
+    mask = cv2.warpAffine(source.mask, matrix, (size, size))
+    moved = points * np.float32(zoom)
+    moved[:, :2] += shift.astype(np.float32)
+    return image.astype(np.uint8), mask.astype(np.float32), moved
+
+
+@dataclass(frozen=True)
+class ColourJitter:
+    gain: Array
+    offset: float
+    saturation: float
+
+    def __call__(self, image: Array) -> Array:
+        grey = image.mean(axis=-1, keepdims=True)
+        out: Array = (grey + (image - grey) * self.saturation) * self.gain + self.offset
+        return out.astype(np.float32)
+
+
+def colour_jitter(rng: np.random.Generator) -> ColourJitter:
+    """One change of light and white balance for all images of a sample."""
+    gain = rng.uniform(0.8, 1.15) * rng.uniform(0.94, 1.06, 3)
+    return ColourJitter(
+        gain.astype(np.float32), float(rng.uniform(-0.04, 0.06)), float(rng.uniform(0.75, 1.2))
+    )
+
+

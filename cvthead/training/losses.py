@@ -1,0 +1,53 @@
+"""Reconstruction losses of the plain training loop (paper section 3.5 without the adversary)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from cvthead.training.perceptual import STLPIPS
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    l1: float = 2.0
+    perceptual: float = 1.0
+    dice: float = 0.3
+
+
+def composite(rgb: Tensor, mask: Tensor, background: Tensor) -> Tensor:
+    return rgb * mask + background * (1 - mask)
+
+
+def reconstruction_losses(
+    rgb: Tensor, logits: Tensor, batch: dict[str, Tensor], perceptual: STLPIPS
+) -> dict[str, Tensor]:
+    """Losses of rendered views against the driven frames.
+
+    Args:
+        rgb: (b, 3, s, s) in [-1, 1]; logits: (b, 1, s, s) of the mask.
+        batch: image (b, 3, s, s) in 0..1, mask and valid (b, 1, s, s), background (b, 3, 1, 1).
+        perceptual: frozen distance network.
+
+    Returns:
+        Scalars l1, perceptual and dice. Pixels beyond the driven picture count nowhere.
+    """
+    target_mask, valid = batch["mask"], batch["valid"]
+    background = batch["background"] * 2 - 1
+    target = composite(batch["image"] * 2 - 1, target_mask, background)
+    mask = torch.sigmoid(logits)
+    own = composite(rgb, mask, background)
+    # Colour under the true mask as well, or a wrong mask would hide wrong colour.
+    painted = composite(rgb, target_mask, background)
+    area = (valid.sum() * 3).clamp(min=1)
+    l1 = (((painted - target).abs() + 0.5 * (own - target).abs()) * valid).sum() / area
+    shown = own * valid + target * (1 - valid)
+    overlap = (mask * target_mask * valid).sum()
+    sizes = ((mask.square() + target_mask.square()) * valid).sum()
+    return {
+        "l1": l1,
+        "perceptual": perceptual(shown, target).float().mean(),
+        "dice": 1 - 2 * overlap / sizes.clamp(min=1),
+    }

@@ -1,0 +1,118 @@
+"""Tracked training records: one compressed file per still or clip.
+
+A record keeps, for every frame, the 256 x 256 head crop, its masks, coefficients and camera, and
+for some frames (the sources) hair, shoulders and visibility as well. One identity has one shape.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cvthead.camera import Camera
+from cvthead.coefficients import Coefficients
+from cvthead.deformation import Deformation
+from cvthead.source import HeadCrop, Source
+
+JPEG_QUALITY = 95
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A stored driving frame.
+
+    Attributes:
+        image: (256, 256, 3) uint8 RGB.
+        mask: (256, 256) float32 person mask.
+        valid: (256, 256) bool.
+        coefficients, camera: of the tracked head; the camera in normalised crop coordinates.
+    """
+
+    image: NDArray[np.uint8]
+    mask: NDArray[np.float32]
+    valid: NDArray[np.bool_]
+    coefficients: Coefficients
+    camera: Camera
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """An open record file; frames are decoded when asked for."""
+
+    path: Path
+    arrays: dict[str, NDArray[np.generic]]
+
+    @classmethod
+    def open(cls, path: Path) -> Record:
+        with np.load(path, allow_pickle=False) as archive:
+            return cls(path, dict(archive))
+
+    @property
+    def frames(self) -> int:
+        return len(self.arrays["pose"])
+
+    @property
+    def sources(self) -> list[int]:
+        """Frame numbers that can serve as source."""
+        return [int(i) for i in self.arrays["sources"]]
+
+    def frame(self, number: int) -> Frame:
+        a = self.arrays
+        image = cv2.imdecode(a[f"image_{number}"], cv2.IMREAD_COLOR_RGB)
+        masks = cv2.imdecode(a[f"mask_{number}"], cv2.IMREAD_COLOR_RGB)
+        assert image is not None and masks is not None
+        coefficients = Coefficients(a["shape"], a["expression"][number], a["pose"][number])  # type: ignore[arg-type]
+        return Frame(
+            image.astype(np.uint8),
+            masks[..., 0].astype(np.float32) / 255,
+            masks[..., 1] > 127,
+            coefficients,
+            Camera(*a["camera"][number].tolist()),
+        )
+
+    def deformation(self, number: int) -> Deformation:
+        a = self.arrays
+        return Deformation(
+            a[f"offsets_{number}"].astype(np.float32),
+            a[f"shell_anchor_{number}"].astype(np.int32),
+            a[f"shell_offset_{number}"].astype(np.float32),
+        )
+
+    def visible(self, number: int, points: int) -> NDArray[np.bool_]:
+        bits = np.unpackbits(self.arrays[f"visible_{number}"], count=points)  # type: ignore[call-overload]
+        return bits.astype(bool)
+
+
+def write(path: Path, heads: list[HeadCrop], sources: dict[int, Source]) -> None:
+    """Store the frames of one identity; ``sources`` by frame number."""
+    arrays: dict[str, NDArray[np.generic]] = {
+        "shape": heads[0].coefficients.shape,
+        "expression": np.stack([h.coefficients.expression for h in heads]),
+        "pose": np.stack([h.coefficients.pose for h in heads]),
+        "camera": np.array([[h.camera.scale, h.camera.tx, h.camera.ty] for h in heads]),
+        "sources": np.array(sorted(sources)),
+    }
+    for number, head in enumerate(heads):
+        arrays[f"image_{number}"] = _encoded(".jpg", head.image[..., ::-1])
+        mask = (head.mask * 255).astype(np.uint8)
+        valid = head.valid.astype(np.uint8) * 255
+        arrays[f"mask_{number}"] = _encoded(".png", np.stack([mask * 0, valid, mask], axis=-1))
+    for number, source in sources.items():
+        arrays[f"offsets_{number}"] = source.deformation.offsets.astype(np.float16)
+        arrays[f"shell_anchor_{number}"] = source.deformation.shell_anchor
+        arrays[f"shell_offset_{number}"] = source.deformation.shell_offset.astype(np.float16)
+        arrays[f"visible_{number}"] = np.packbits(source.visible)
+    temporary = path.with_suffix(".tmp.npz")
+    np.savez(temporary, **arrays)  # type: ignore[arg-type]
+    temporary.rename(path)
+
+
+def _encoded(kind: str, image: NDArray[np.generic]) -> NDArray[np.uint8]:
+    quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if kind == ".jpg" else []
+    done, data = cv2.imencode(kind, np.ascontiguousarray(image), quality)
+    assert done
+    return data.astype(np.uint8)

@@ -1,0 +1,94 @@
+"""Which points the source image sees.
+
+A visible point may take colour and features from its projection (the pixel-aligned branch);
+a hidden one must not, whatever lies in front of it (paper section 3.3, motivation).
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cvthead.points import PointLayout
+
+# Coarse enough that neighbouring vertices close the surface between them.
+Z_BUFFER_PIXELS = 72
+# Metres behind the nearest point that still count as the same surface.
+DEPTH_TOLERANCE = 0.012
+GRAZING = 0.1
+MASK_LEVEL = 0.5
+
+
+def visible_points(
+    layout: PointLayout,
+    faces: NDArray[np.int32],
+    points: NDArray[np.float32],
+    mask: NDArray[np.float32],
+    scale: float,
+) -> NDArray[np.bool_]:
+    """Points in front of the surface, facing the camera, inside frame and person mask.
+
+    Args:
+        layout: numbering of the points.
+        faces: (F, 3) triangles over the mesh vertices.
+        points: (layout.total, 3) normalised source projections.
+        mask: (S, S) person mask of the crop, 0..1, 0 beyond the picture.
+        scale: of the normalised camera, normalised units per metre.
+
+    Returns:
+        (layout.total,) bool.
+    """
+    return (
+        _in_front(points, scale)
+        & _facing(layout, faces, points)
+        & inside_mask(points, mask)
+    )
+
+
+def inside_mask(points: NDArray[np.float32], mask: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """(P,) whether each projection lies in the frame and on the person."""
+    size = mask.shape[0]
+    pixel = np.floor((points[:, :2] * 0.5 + 0.5) * size).astype(np.int64)
+    inside = ((pixel >= 0) & (pixel < size)).all(axis=1)
+    x, y = np.clip(pixel, 0, size - 1).T
+    return inside & (mask[y, x] > MASK_LEVEL)
+
+
+def _in_front(points: NDArray[np.float32], scale: float) -> NDArray[np.bool_]:
+    size = Z_BUFFER_PIXELS
+    pixel = np.floor((points[:, :2] * 0.5 + 0.5) * size).astype(np.int64)
+    inside = ((pixel >= 0) & (pixel < size)).all(axis=1)
+    index = np.where(inside, pixel[:, 1] * size + pixel[:, 0], size * size)
+    nearest = np.full(size * size + 1, np.inf, dtype=np.float32)
+    np.minimum.at(nearest, index, points[:, 2])
+    return np.asarray(points[:, 2] <= nearest[index] + DEPTH_TOLERANCE * scale)
+
+
+def _facing(
+    layout: PointLayout, faces: NDArray[np.int32], points: NDArray[np.float32]
+) -> NDArray[np.bool_]:
+    vertices = points[: layout.vertices]
+    corner = vertices[faces]
+    # In image axes (y down, depth away) an outward normal towards the camera has negative z.
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    total = np.zeros_like(vertices)
+    for k in range(3):
+        for axis in range(3):
+            total[:, axis] += np.bincount(
+                faces[:, k], weights=normal[:, axis], minlength=layout.vertices
+            )
+    length = np.linalg.norm(total, axis=1) + 1e-12
+    towards = -total[:, 2] / length
+    a, b = layout.edges.T
+    facing = np.ones(layout.total, dtype=bool)
+    facing[: layout.vertices] = towards > -GRAZING
+    facing[layout.vertices : layout.surface] = (towards[a] + towards[b]) / 2 > -GRAZING
+    return facing
+
+
+def eroded(mask: NDArray[np.float32], pixels: int) -> NDArray[np.float32]:
+    """The mask without its outermost pixels, where background shines through."""
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * pixels + 1,) * 2)
+    out: NDArray[np.float32] = cv2.erode(mask, kernel)
+    return out

@@ -1,0 +1,1 @@
+"""Maintainers' commands that build the files under ``cvthead/assets``; not installed."""

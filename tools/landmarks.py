@@ -1,0 +1,68 @@
+"""Places the 478 face-mesh landmarks on the final surface.
+
+``data/landmark_embedding.npz`` holds, for every landmark, three MakeHuman vertices, barycentric
+coordinates, the rms distance of the landmark network's points from that place (over rendered
+heads seen from many sides), and the landmark on the other side.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tools.closest import closest_points
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+EMBEDDING = Path(__file__).parent / "data" / "landmark_embedding.npz"
+FIRST_IRIS = 468
+
+
+@dataclass(frozen=True)
+class Embedding:
+    """Attributes: faces (478,), barycentric (478, 3), sigma (478,) in metres."""
+
+    faces: Ints
+    barycentric: Floats
+    sigma: Floats
+
+
+def embed_landmarks(
+    base_template: Floats,
+    ids: Ints,
+    vertices: Floats,
+    faces: Ints,
+    mirror: Ints,
+    skin: NDArray[np.bool_],
+    eyes: NDArray[np.bool_],
+) -> Embedding:
+    """Nearest places on the skin, and for the irises on the eyeballs; mirror-consistent.
+
+    Args:
+        base_template: (B, 3) template at the MakeHuman vertices ``ids``.
+        skin, eyes: (F,) faces that may carry face and iris landmarks.
+    """
+    with np.load(EMBEDDING, allow_pickle=False) as data:
+        corners = np.searchsorted(ids, data["vertices"])
+        points = np.einsum("lk,lkc->lc", data["barycentric"], base_template[corners])
+        pair, sigma = data["mirror"], data["sigma"]
+    points = (points + points[pair] * [-1, 1, 1]) / 2
+    face = np.empty(len(points), np.int64)
+    barycentric = np.empty((len(points), 3))
+    for chosen, allowed in ((slice(0, FIRST_IRIS), skin), (slice(FIRST_IRIS, None), eyes)):
+        index = np.nonzero(allowed)[0]
+        nearest, barycentric[chosen] = closest_points(points[chosen], vertices, faces[index])
+        face[chosen] = index[nearest]
+    lookup = {frozenset(f): i for i, f in enumerate(faces.tolist())}
+    for left, right in enumerate(pair.tolist()):
+        if left >= right:
+            continue
+        twin = mirror[faces[face[left]]].tolist()
+        face[right] = lookup[frozenset(twin)]
+        place = dict(zip(twin, barycentric[left], strict=True))
+        barycentric[right] = [place[v] for v in faces[face[right]].tolist()]
+    return Embedding(face, barycentric, (sigma + sigma[pair]) / 2)
