@@ -1,5 +1,7 @@
 """One-shot head avatars: encode a portrait once, render it from FLAME coefficients.
 
+Example::
+
     from cvthead import Controls, Pipeline
     pipeline = Pipeline.load()
     avatar = pipeline.encode(image)

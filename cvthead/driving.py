@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-
 import numpy as np
 
 from cvthead.avatar import Avatar
@@ -12,8 +11,6 @@ from cvthead.camera import Camera, Crop
 from cvthead.coefficients import JOINTS, Coefficients
 from cvthead.controls import composed
 from cvthead.tracking.tracker import TrackedFace
-
-
 
 
 def drive(
@@ -40,10 +37,7 @@ def drive(
         start = reference.coefficients
         expression = source.expression + driver.expression - start.expression
         pose = np.concatenate(
-            [
-                composed(composed(driver.joint(j), -start.joint(j)), source.joint(j))
-                for j in JOINTS
-            ]
+            [composed(composed(driver.joint(j), -start.joint(j)), source.joint(j)) for j in JOINTS]
         )
         if crop is not None:
             camera = _moved(avatar.camera, reference.camera.in_crop(crop), camera)

@@ -7,6 +7,7 @@ runs the head model, the splat and the U-Net, and nothing else.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -49,8 +50,12 @@ class Pipeline:
     fingerprint: str
 
     @classmethod
-    def load(cls, preset: str = "open") -> Pipeline:
+    def load(cls, preset: str = "open", weights: Path | None = None) -> Pipeline:
         """Load head, tracker and trained weights.
+
+        Args:
+            preset: "open".
+            weights: other weights of the same preset than the packaged ones.
 
         Raises:
             AssetError: an unknown preset, or a missing or altered file.
@@ -60,8 +65,9 @@ class Pipeline:
         head = HeadModel.load()
         layout = PointLayout.of(head)
         model = CVTHead(OPEN, MeshHierarchy.load(), layout)
-        mark = load_into(model, packaged_weights(preset))
-        model = model.eval().requires_grad_(False).to(memory_format=torch.channels_last)
+        mark = load_into(model, weights or packaged_weights(preset))
+        model = model.eval().requires_grad_(False)
+        model = model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         return cls(
             head,
             ArkitMap.load(),
@@ -146,9 +152,7 @@ class Pipeline:
         self, avatar: Avatar, coefficients: Coefficients, camera: Camera
     ) -> NDArray[np.float32]:
         """Driven point projections (P, 3): head model, skinning, camera."""
-        points = driven_points(
-            self.head, self.layout, coefficients, avatar.deformation, camera
-        )
+        points = driven_points(self.head, self.layout, coefficients, avatar.deformation, camera)
         return points[: len(avatar.descriptors)]
 
     @torch.inference_mode()

@@ -36,7 +36,9 @@ class PointLayout:
     @classmethod
     def of(cls, head: HeadModel) -> PointLayout:
         detail = np.isin(head.region, DETAIL_REGIONS)
-        sides = np.concatenate([head.faces[:, [0, 1]], head.faces[:, [1, 2]], head.faces[:, [2, 0]]])
+        sides = np.concatenate(
+            [head.faces[:, [0, 1]], head.faces[:, [1, 2]], head.faces[:, [2, 0]]]
+        )
         sides = sides[detail[sides].all(1)]
         edges = np.unique(np.sort(sides, axis=1), axis=0)
         flipped = np.sort(head.mirror[edges], axis=1)

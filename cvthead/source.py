@@ -78,9 +78,7 @@ def cut_head(tracker: Tracker, image: NDArray[np.uint8], face: TrackedFace) -> H
     vertices = tracker.head.vertices(face.coefficients)[tracker.head.region == Region.FACE]
     kept = person_mask(probability, valid, to_pixels(camera.project(vertices)))
     mask = np.where(kept | (probability < 0.5), probability, 0) * valid
-    return HeadCrop(
-        pixels, mask.astype(np.float32), valid, crop, camera, face.coefficients
-    )
+    return HeadCrop(pixels, mask.astype(np.float32), valid, crop, camera, face.coefficients)
 
 
 def driven_points(

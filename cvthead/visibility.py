@@ -39,11 +39,7 @@ def visible_points(
     Returns:
         (layout.total,) bool.
     """
-    return (
-        _in_front(points, scale)
-        & _facing(layout, faces, points)
-        & inside_mask(points, mask)
-    )
+    return _in_front(points, scale) & _facing(layout, faces, points) & inside_mask(points, mask)
 
 
 def inside_mask(points: NDArray[np.float32], mask: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -52,7 +48,7 @@ def inside_mask(points: NDArray[np.float32], mask: NDArray[np.float32]) -> NDArr
     pixel = np.floor((points[:, :2] * 0.5 + 0.5) * size).astype(np.int64)
     inside = ((pixel >= 0) & (pixel < size)).all(axis=1)
     x, y = np.clip(pixel, 0, size - 1).T
-    return inside & (mask[y, x] > MASK_LEVEL)
+    return np.asarray(inside & (mask[y, x] > MASK_LEVEL))
 
 
 def _in_front(points: NDArray[np.float32], scale: float) -> NDArray[np.bool_]:
@@ -90,5 +86,4 @@ def _facing(
 def eroded(mask: NDArray[np.float32], pixels: int) -> NDArray[np.float32]:
     """The mask without its outermost pixels, where background shines through."""
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * pixels + 1,) * 2)
-    out: NDArray[np.float32] = cv2.erode(mask, kernel)
-    return out
+    return np.asarray(cv2.erode(mask, kernel), np.float32)

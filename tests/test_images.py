@@ -28,7 +28,7 @@ def picture(height: int = 60, width: int = 80) -> NDArray[np.uint8]:
 
 def saved(image: Image.Image, kind: str, **options: object) -> bytes:
     out = BytesIO()
-    image.save(out, kind, **options)  # type: ignore[arg-type]
+    image.save(out, kind, **options)
     return out.getvalue()
 
 
@@ -299,7 +299,7 @@ def test_what_is_encoded_can_be_decoded(kind: str, channels: int) -> None:
 def test_alpha_survives_in_png_and_webp() -> None:
     image = np.dstack([picture(), picture()[..., 0]])
     for kind in ("png", "webp"):
-        with Image.open(BytesIO(encode_image(image, kind))) as opened:  # type: ignore[arg-type]
+        with Image.open(BytesIO(encode_image(image, kind))) as opened:
             assert np.array_equal(np.asarray(opened)[..., 3], image[..., 3])
 
 

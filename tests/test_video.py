@@ -51,13 +51,16 @@ def driver(
 ) -> Path:
     """A black 25 fps video with a white flash and a tone from 1.0 s on."""
     with av.open(str(path), "w") as output:
-        stream = output.add_stream(video, rate=25)  # type: ignore[call-overload]
+        stream = output.add_stream(video, rate=25)
+        assert isinstance(stream, av.VideoStream)
         stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
         if prepare is not None:
             prepare(stream)
-        sound = None
+        sound: av.AudioStream | None = None
         if audio is not None:
-            sound = output.add_stream(audio, rate=48_000, layout="stereo")
+            added = output.add_stream(audio, rate=48_000, layout="stereo")
+            assert isinstance(added, av.AudioStream)
+            sound = added
         for number in range(round(seconds * 25)):
             image = np.full((48, 64, 3), 255 if number >= 25 else 0, np.uint8)
             output.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))

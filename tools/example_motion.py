@@ -1,6 +1,6 @@
 """Writes ``examples/talk.json``: a made animation of a talking, smiling, turning head.
 
-python -m tools.example_motion examples/talk.json
+Run as ``python -m tools.example_motion examples/talk.json``.
 """
 
 from __future__ import annotations

@@ -11,23 +11,14 @@ import numpy as np
 
 from cvthead.camera import Camera
 from cvthead.coefficients import Coefficients
-from cvthead.deformation import DeformationModel
 from cvthead.errors import CVTHeadError
 from cvthead.evaluation.metrics import Metrics
 from cvthead.evaluation.page import write_page
 from cvthead.evaluation.protocol import Animate, Clip, Draw, Drawn, Evaluator, Image
 from cvthead.evaluation.report import Report
 from cvthead.evaluation.sweep import sweep
-from cvthead.head.arkit import ArkitMap
-from cvthead.head.hierarchy import MeshHierarchy
-from cvthead.head.model import HeadModel
-from cvthead.model.config import OPEN
-from cvthead.model.cvthead import CVTHead
 from cvthead.pipeline import Pipeline
-from cvthead.points import PointLayout
 from cvthead.source import HeadCrop
-from cvthead.tracking.tracker import Tracker
-from cvthead.weights import load_into
 
 
 def animate_with(pipeline: Pipeline) -> Animate:
@@ -43,30 +34,6 @@ def animate_with(pipeline: Pipeline) -> Animate:
         return draw
 
     return animate
-
-
-def load_pipeline(weights: Path | None) -> Pipeline:
-    """The open preset with the packaged weights, or with a checkpoint of the same model.
-
-    Raises:
-        AssetError: a missing or damaged file, or weights that do not fit.
-    """
-    if weights is None:
-        return Pipeline.load()
-    head = HeadModel.load()
-    layout = PointLayout.of(head)
-    model = CVTHead(OPEN, MeshHierarchy.load(), layout)
-    mark = load_into(model, weights)
-    return Pipeline(
-        head=head,
-        arkit=ArkitMap.load(),
-        tracker=Tracker.load(head),
-        deformer=DeformationModel.from_head(head),
-        layout=layout,
-        model=model.eval().requires_grad_(False),
-        preset="open",
-        fingerprint=mark,
-    )
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -88,7 +55,7 @@ def evaluate(
     paths: list[Path], output: Path, drivers: int, people: int, weights: Path | None
 ) -> Report:
     """Score the clips and write ``index.html``, ``report.md`` and ``report.json`` to a folder."""
-    pipeline = load_pipeline(weights)
+    pipeline = Pipeline.load(weights=weights)
     evaluator = Evaluator(pipeline.tracker, pipeline.deformer, Metrics(), animate_with(pipeline))
     clips: list[Clip] = []
     for path in paths:

@@ -29,9 +29,7 @@ class CVTHead(nn.Module):
     mirror: Tensor  # (vertices + midpoints,)
     image_code: Tensor  # (tokens, token_size)
 
-    def __init__(
-        self, config: ModelConfig, hierarchy: MeshHierarchy, layout: PointLayout
-    ) -> None:
+    def __init__(self, config: ModelConfig, hierarchy: MeshHierarchy, layout: PointLayout) -> None:
         super().__init__()
         self.config = config
         size = config.token_size
@@ -81,7 +79,10 @@ class CVTHead(nn.Module):
         embedding[:, -anchor.shape[1] :] += self.fusion.shell_embedding
         shell = torch.arange(len(self.mirror), points.shape[1], device=self.mirror.device)
         mirror = torch.cat([self.mirror, shell])
-        return self.fusion(feature, embedding, pixels.float(), source, points, visible, mirror)
+        out: Tensor = self.fusion(
+            feature, embedding, pixels.float(), source, points, visible, mirror
+        )
+        return out
 
     def _spread(self, vertex: Tensor, anchor: Tensor) -> Tensor:
         """(b, n, c) vertex values -> (b, p, c) at vertices, edge midpoints and shell points."""

@@ -29,9 +29,7 @@ class LightUNet(nn.Module):
         self.ups = nn.ModuleList()
         for size in reversed(sizes[:-1]):
             self.laterals.append(conv_bn_relu(before, size, kernel=1))
-            self.ups.append(
-                nn.Sequential(conv_bn_relu(2 * size, size), conv_bn_relu(size, size))
-            )
+            self.ups.append(nn.Sequential(conv_bn_relu(2 * size, size), conv_bn_relu(size, size)))
             before = size
         self.to_shuffle = nn.Conv2d(before, HEAD_SIZE * unshuffle**2, 3, padding=1)
         self.refine = nn.Conv2d(HEAD_SIZE, HEAD_SIZE, 3, padding=1)
@@ -44,9 +42,7 @@ class LightUNet(nn.Module):
         for level, down in enumerate(self.downs):
             x = down(F.max_pool2d(x, 2) if level else x)
             skips.append(x)
-        for lateral, up, skip in zip(
-            self.laterals, self.ups, reversed(skips[:-1]), strict=True
-        ):
+        for lateral, up, skip in zip(self.laterals, self.ups, reversed(skips[:-1]), strict=True):
             x = up(torch.cat([upsample(lateral(x)), skip], dim=1))
         x = F.relu(F.pixel_shuffle(self.to_shuffle(x), self.unshuffle))
         out: Tensor = self.to_image(F.relu(self.refine(x)))

@@ -14,9 +14,7 @@ class PyramidEncoder(nn.Module):
     def __init__(self, token_size: int, pixel_size: int) -> None:
         super().__init__()
         self.down1 = conv_bn_relu(4, 24, stride=2)
-        self.down2 = nn.Sequential(
-            conv_bn_relu(24, 48, stride=2), conv_bn_relu(48, 48)
-        )
+        self.down2 = nn.Sequential(conv_bn_relu(24, 48, stride=2), conv_bn_relu(48, 48))
         self.down3 = nn.Sequential(conv_bn_relu(48, 96, stride=2), conv_bn_relu(96, 96))
         self.down4 = nn.Sequential(conv_bn_relu(96, 160, stride=2), conv_bn_relu(160, 160))
         self.to_tokens = nn.Conv2d(160, token_size, 1)

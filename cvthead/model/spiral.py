@@ -24,7 +24,9 @@ class SpiralConv(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         vertices, length = self.spiral.shape
         neighbours = x.index_select(1, self.spiral.flatten())  # b (v l) c
-        return self.linear(neighbours.reshape(len(x), vertices, length * x.shape[-1]))
+        flat = neighbours.reshape(len(x), vertices, length * x.shape[-1])
+        out: Tensor = self.linear(flat)
+        return out
 
 
 class Unpool(nn.Module):
@@ -62,8 +64,5 @@ class SpiralUpsampler(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """(b, coarse, c) -> (b, vertices, sizes[-1])."""
         for step, conv in enumerate(self.convs):
-            if step < len(self.unpools):
-                x = F.elu(conv(self.unpools[step](x)))
-            else:
-                x = conv(x)
+            x = F.elu(conv(self.unpools[step](x))) if step < len(self.unpools) else conv(x)
         return x

@@ -34,7 +34,8 @@ class FeedForward(nn.Module):
         self.outer = nn.Linear(hidden, size)
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.outer(F.gelu(self.inner(self.norm(x))))
+        out: Tensor = self.outer(F.gelu(self.inner(self.norm(x))))
+        return out
 
 
 class Transformer(nn.Module):
@@ -48,7 +49,8 @@ class Transformer(nn.Module):
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        for attention, feed_forward in self.layers:  # type: ignore[misc]
+        for layer in self.layers:
+            attention, feed_forward = layer.children()
             x = x + attention(x)
             x = x + feed_forward(x)
         return x

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -43,7 +44,14 @@ class PairDataset(Dataset[dict[str, Tensor]]):
     """Sample ``i`` depends on ``seed`` and ``i`` alone, so a run resumes exactly."""
 
     def __init__(
-        self, folder: Path, head: HeadModel, layout: PointLayout, *, size: int, seed: int, samples: int
+        self,
+        folder: Path,
+        head: HeadModel,
+        layout: PointLayout,
+        *,
+        size: int,
+        seed: int,
+        samples: int,
     ) -> None:
         self.head, self.layout = head, layout
         self.size, self.seed, self.samples = size, seed, samples
@@ -63,7 +71,7 @@ class PairDataset(Dataset[dict[str, Tensor]]):
         rng = np.random.default_rng((self.seed, index))
         use_clip = bool(self.clips) and (not self.stills or rng.random() < CLIP_SHARE)
         files: Sequence[Path] = self.clips if use_clip else self.stills
-        record = Record.open(files[rng.integers(len(files))])
+        record = Record.open(files[int(rng.integers(len(files)))])
         number = int(rng.choice(record.sources))
         source = record.frame(number)
         deformation = record.deformation(number)
@@ -80,13 +88,15 @@ class PairDataset(Dataset[dict[str, Tensor]]):
             views = []
             for other in rng.integers(record.frames, size=VIEWS):
                 frame = record.frame(int(other))
-                views.append(View(frame.image / np.float32(255), frame.mask, frame.valid * np.float32(1), points(frame)))
+                views.append(as_view(frame, points(frame)))
         else:
-            view = View(source.image / np.float32(255), source.mask, source.valid * np.float32(1), own)
+            view = as_view(source, own)
             views = [view, mirrored(view, self.layout)]
         colours = colour_jitter(rng)
         image, mask, own = jittered(rng, source, own)
-        image = np.round(np.clip(colours(image / np.float32(255)), 0, 1) * 255).astype(np.uint8)
+        image = np.round(
+            np.clip(colours(image.astype(np.float32) / np.float32(255)), 0, 1) * 255
+        ).astype(np.uint8)
         views = [replace(v, image=np.clip(colours(v.image), 0, 1)) for v in views]
         network = network_input(image, mask)
         inside = (np.abs(own[:, :2]) < 1).all(axis=1)
@@ -96,7 +106,7 @@ class PairDataset(Dataset[dict[str, Tensor]]):
             own, visible = flip_points(own, self.layout), flip_order(visible, self.layout)
             anchor = self.head.mirror[anchor].astype(np.int64)
             views = [mirrored(v, self.layout) for v in views]
-        stack = {
+        stack: dict[str, NDArray[Any]] = {
             "source": network,
             "points": own,
             "visible": visible,
@@ -104,7 +114,7 @@ class PairDataset(Dataset[dict[str, Tensor]]):
             "background": np.full((VIEWS, 3, 1, 1), 1, np.float32) * rng.random((1, 3, 1, 1)),
             "image": np.stack([self._resized(v.image).transpose(2, 0, 1) for v in views]),
             "mask": np.stack([self._resized(v.mask)[None] for v in views]),
-            "valid": np.stack([(self._resized(v.valid)[None] > 0.99) for v in views]),
+            "valid": np.stack([self._resized(v.valid)[None] > 0.99 for v in views]),
             "driven": np.stack([v.points for v in views]),
         }
         return {
@@ -117,7 +127,13 @@ class PairDataset(Dataset[dict[str, Tensor]]):
     def _resized(self, image: Array) -> Array:
         if image.shape[0] == self.size:
             return image
-        return cv2.resize(image, (self.size, self.size), interpolation=cv2.INTER_AREA).astype(np.float32)
+        size = (self.size, self.size)
+        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def as_view(frame: Frame, points: Array) -> View:
+    image = frame.image.astype(np.float32) / np.float32(255)
+    return View(image, frame.mask, frame.valid.astype(np.float32), points)
 
 
 def flip_order(values: NDArray[np.float32], layout: PointLayout) -> Array:
@@ -134,7 +150,10 @@ def flip_points(points: Array, layout: PointLayout) -> Array:
 
 def mirrored(view: View, layout: PointLayout) -> View:
     return View(
-        view.image[:, ::-1], view.mask[:, ::-1], view.valid[:, ::-1], flip_points(view.points, layout)
+        view.image[:, ::-1],
+        view.mask[:, ::-1],
+        view.valid[:, ::-1],
+        flip_points(view.points, layout),
     )
 
 
@@ -163,8 +182,8 @@ class ColourJitter:
 
     def __call__(self, image: Array) -> Array:
         grey = image.mean(axis=-1, keepdims=True)
-        out: Array = (grey + (image - grey) * self.saturation) * self.gain + self.offset
-        return out.astype(np.float32)
+        out = (grey + (image - grey) * self.saturation) * self.gain + self.offset
+        return np.asarray(np.clip(out, 0, 1), np.float32)
 
 
 def colour_jitter(rng: np.random.Generator) -> ColourJitter:
@@ -173,5 +192,3 @@ def colour_jitter(rng: np.random.Generator) -> ColourJitter:
     return ColourJitter(
         gain.astype(np.float32), float(rng.uniform(-0.04, 0.06)), float(rng.uniform(0.75, 1.2))
     )
-
-

@@ -1,6 +1,6 @@
 """Track stills and clips once and store them as training records.
 
-    python -m cvthead.training.prepare ../shared/data/stills/train ../shared/data/clips/train OUT
+python -m cvthead.training.prepare ../shared/data/stills/train ../shared/data/clips/train OUT
 """
 
 from __future__ import annotations

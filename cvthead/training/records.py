@@ -62,13 +62,14 @@ class Record:
 
     def frame(self, number: int) -> Frame:
         a = self.arrays
-        image = cv2.imdecode(a[f"image_{number}"], cv2.IMREAD_COLOR_RGB)
-        masks = cv2.imdecode(a[f"mask_{number}"], cv2.IMREAD_COLOR_RGB)
-        assert image is not None and masks is not None
+        image = cv2.imdecode(a[f"image_{number}"].astype(np.uint8), cv2.IMREAD_COLOR_RGB)
+        masks = cv2.imdecode(a[f"mask_{number}"].astype(np.uint8), cv2.IMREAD_COLOR_RGB)
+        assert image is not None
+        assert masks is not None
         coefficients = Coefficients(a["shape"], a["expression"][number], a["pose"][number])  # type: ignore[arg-type]
         return Frame(
             image.astype(np.uint8),
-            masks[..., 0].astype(np.float32) / 255,
+            masks[..., 0].astype(np.float32) / np.float32(255),
             masks[..., 1] > 127,
             coefficients,
             Camera(*a["camera"][number].tolist()),
@@ -83,7 +84,7 @@ class Record:
         )
 
     def visible(self, number: int, points: int) -> NDArray[np.bool_]:
-        bits = np.unpackbits(self.arrays[f"visible_{number}"], count=points)  # type: ignore[call-overload]
+        bits = np.unpackbits(self.arrays[f"visible_{number}"].astype(np.uint8), count=points)
         return bits.astype(bool)
 
 

@@ -60,7 +60,9 @@ class TrainConfig:
 def learning_rate(config: TrainConfig, step: int) -> float:
     warm = min(1.0, (step + 1) / 100)
     late = max(0.0, (step / config.steps - 0.5) * 2)
-    return config.learning_rate * warm * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * min(late, 1))))
+    return (
+        config.learning_rate * warm * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * min(late, 1))))
+    )
 
 
 def freeze_norms(model: nn.Module) -> None:
@@ -84,10 +86,11 @@ def train(config: TrainConfig, records: Path, run: Path, init: Path | None) -> N
     run.mkdir(parents=True, exist_ok=True)
     head = HeadModel.load()
     layout = PointLayout.of(head)
-    model = CVTHead(OPEN, MeshHierarchy.load(), layout).to(memory_format=torch.channels_last)
+    model = CVTHead(OPEN, MeshHierarchy.load(), layout)
+    model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     averaged = torch.optim.swa_utils.AveragedModel(
         model,
-        multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(config.average),
+        multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(config.average),  # type: ignore[no-untyped-call]
         use_buffers=True,
     )
     optimizer = torch.optim.AdamW(
@@ -135,15 +138,16 @@ def train(config: TrainConfig, records: Path, run: Path, init: Path | None) -> N
                 for name in ("image", "mask", "valid", "background")
             }
             losses = reconstruction_losses(rgb, logits, views, perceptual)
-        total = sum((getattr(weights, name) * value for name, value in losses.items()), torch.zeros(()))
+        total = torch.stack([getattr(weights, k) * v for k, v in losses.items()]).sum()
         optimizer.zero_grad(set_to_none=True)
-        total.backward()
+        total.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(model.parameters(), 1.0)
         optimizer.step()
         averaged.update_parameters(model)
         step += 1
         for name, value in losses.items():
-            running[name] = running.get(name, float(value)) * 0.98 + float(value) * 0.02
+            now = float(value.detach())
+            running[name] = running.get(name, now) * 0.98 + now * 0.02
         if step % 50 == 0:
             seconds = (time.monotonic() - started) / (step - first)
             line = {"step": step, "seconds_per_step": round(seconds, 3)} | {

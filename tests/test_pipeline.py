@@ -1,0 +1,164 @@
+"""The cheap path on the released weights and the sample portrait."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from cvthead import Avatar, Controls, Pipeline
+from cvthead.avatar import Avatar as AvatarType
+from cvthead.cache import AvatarCache
+from cvthead.coefficients import Coefficients
+from cvthead.errors import AvatarFileError, CoefficientsError, ModelChangedError, NoFaceError
+from cvthead.images import read_image
+
+PORTRAIT = Path(__file__).parents[1] / "examples" / "astronaut.png"
+TURN = 0.35  # radians
+
+
+@pytest.fixture(scope="module")
+def pipeline() -> Pipeline:
+    return Pipeline.load()
+
+
+@pytest.fixture(scope="module")
+def portrait() -> NDArray[np.uint8]:
+    return read_image(PORTRAIT)
+
+
+@pytest.fixture(scope="module")
+def avatar(pipeline: Pipeline, portrait: NDArray[np.uint8]) -> AvatarType:
+    return pipeline.encode(portrait)
+
+
+class Calls:
+    """Counts forward passes of a module; forwards nothing itself."""
+
+    def __init__(self, module: nn.Module) -> None:
+        self.count = 0
+        module.register_forward_hook(self._seen)
+
+    def _seen(self, module: nn.Module, inputs: tuple[Tensor, ...], output: object) -> None:
+        self.count += 1
+
+
+def test_second_render_of_an_id_runs_no_encoder(
+    pipeline: Pipeline, portrait: NDArray[np.uint8], tmp_path: Path
+) -> None:
+    encoder, transformer, unet = (
+        Calls(m) for m in (pipeline.model.encoder, pipeline.model.transformer, pipeline.model.unet)
+    )
+    cache = AvatarCache(tmp_path)
+    key = cache.put(pipeline.encode(portrait))
+    assert (encoder.count, transformer.count) == (1, 1)
+    for jaw in (0.0, 0.2):
+        pipeline.render(cache.get(key), Controls(jaw=(jaw, 0, 0)))
+    assert (encoder.count, transformer.count, unet.count) == (1, 1, 2)
+
+
+def test_file_round_trip_renders_the_same_and_is_small(
+    pipeline: Pipeline, avatar: AvatarType, tmp_path: Path
+) -> None:
+    path = tmp_path / "me.avatar"
+    avatar.save(path)
+    assert path.stat().st_size <= 1_000_000
+    again = Avatar.load(path)
+    controls = Controls(arkit={"jawOpen": 0.4}, global_rotation=(0, 0.2, 0))
+    first, second = pipeline.render(avatar, controls), pipeline.render(again, controls)
+    # Offsets are stored in half precision: a point may fall into the neighbouring pixel.
+    difference = np.abs(first.over((255, 255, 255)).astype(int) - second.over((255, 255, 255)))
+    assert difference.mean() < 0.5
+
+
+def test_render_looks_like_the_portrait(
+    pipeline: Pipeline, avatar: AvatarType, portrait: NDArray[np.uint8]
+) -> None:
+    frame = pipeline.render(avatar)
+    own, _ = avatar.crop.cut(portrait)
+    inside = frame.alpha > 200
+    assert 0.2 < inside.mean() < 0.9
+    error = np.abs(frame.rgb.astype(float) - own)[inside].mean() / 255
+    copy_of_mean = np.abs(own[inside].mean(axis=0) - own)[inside].mean() / 255
+    assert error < 0.5 * copy_of_mean
+
+
+def tracked(pipeline: Pipeline, avatar: AvatarType, controls: Controls) -> Coefficients:
+    """Coefficients found again in the rendered picture."""
+    image = pipeline.render(avatar, controls).over((255, 255, 255))
+    return pipeline.tracker.track(image, shape=avatar.coefficients.shape).coefficients
+
+
+def test_rendered_pose_is_the_one_asked_for(pipeline: Pipeline, avatar: AvatarType) -> None:
+    for turn in (-TURN, 0.0, TURN):
+        found = tracked(pipeline, avatar, Controls(global_rotation=(0, turn, 0)))
+        assert found.joint("global")[1] == pytest.approx(turn, abs=0.12)
+    shut = tracked(pipeline, avatar, Controls(arkit={}))
+    wide = tracked(pipeline, avatar, Controls(arkit={"jawOpen": 0.8}))
+    assert wide.joint("jaw")[0] - shut.joint("jaw")[0] > 0.08
+
+
+def test_absent_keeps_the_source_and_zero_means_zero(
+    pipeline: Pipeline, avatar: AvatarType
+) -> None:
+    source = avatar.coefficients
+    same = Controls(expression=source.expression, global_rotation=source.joint("global"))
+    kept = pipeline.render(avatar)
+    assert np.array_equal(kept.rgb, pipeline.render(avatar, same).rgb)
+    assert np.array_equal(kept.rgb, pipeline.render(avatar, Controls(mode="relative")).rgb)
+    zero = Controls(expression=np.zeros(50), jaw=np.zeros(3))
+    explicit = replace(source, expression=np.zeros(50, np.float32)).with_joints({"jaw": (0, 0, 0)})
+    expected = pipeline.render_coefficients(avatar, explicit, avatar.camera)
+    assert np.array_equal(pipeline.render(avatar, zero).rgb, expected.rgb)
+    assert not np.array_equal(kept.rgb, expected.rgb)
+
+
+def test_relative_adds_to_the_source(pipeline: Pipeline, avatar: AvatarType) -> None:
+    added = np.zeros(50, np.float32)
+    added[0] = 1.5
+    relative = pipeline.render(avatar, Controls(expression=added, mode="relative"))
+    absolute = pipeline.render(avatar, Controls(expression=avatar.coefficients.expression + added))
+    assert np.array_equal(relative.rgb, absolute.rgb)
+
+
+def test_other_weights_are_refused(pipeline: Pipeline, avatar: AvatarType) -> None:
+    with pytest.raises(ModelChangedError, match="0123456789abcdef"):
+        pipeline.render(replace(avatar, fingerprint="0123456789abcdef"))
+
+
+def test_deformation_can_be_left_out(pipeline: Pipeline, portrait: NDArray[np.uint8]) -> None:
+    bald = pipeline.encode(portrait, deform=False)
+    assert not bald.deformation.offsets.any()
+    assert len(bald.deformation.shell_anchor) == 0
+
+
+def test_wrong_input_is_named(pipeline: Pipeline, avatar: AvatarType, tmp_path: Path) -> None:
+    with pytest.raises(NoFaceError):
+        pipeline.encode(np.full((200, 200, 3), 127, np.uint8))
+    with pytest.raises(CoefficientsError, match="expression"):
+        Controls(expression=[0.0] * 49)
+    with pytest.raises(CoefficientsError, match="NaN"):
+        Controls(jaw=(np.nan, 0, 0))
+    with pytest.raises(CoefficientsError, match="noSuchUnit"):
+        pipeline.render(avatar, Controls(arkit={"noSuchUnit": 0.5}))
+    missing = tmp_path / "missing.avatar"
+    with pytest.raises(AvatarFileError, match="does not exist"):
+        Avatar.load(missing)
+    missing.write_bytes(PORTRAIT.read_bytes())
+    with pytest.raises(AvatarFileError):
+        Avatar.load(missing)
+
+
+def test_alpha_and_background(pipeline: Pipeline, avatar: AvatarType) -> None:
+    frame = pipeline.render(avatar)
+    red = frame.over((255, 0, 0))
+    assert np.array_equal(
+        red[frame.alpha == 0], np.tile([255, 0, 0], ((frame.alpha == 0).sum(), 1))
+    )
+    assert np.array_equal(red[frame.alpha == 255], frame.rgb[frame.alpha == 255])
+    assert frame.rgba().shape == (256, 256, 4)
+    assert pipeline.background(avatar).shape == (256, 256, 3)
