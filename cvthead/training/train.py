@@ -79,8 +79,23 @@ def render_views(model: CVTHead, batch: dict[str, Tensor], size: int) -> tuple[T
     return model.paint(rearrange(batch["driven"], "b v p c -> (b v) p c"), descriptors, size)
 
 
-def train(config: TrainConfig, records: Path, run: Path, init: Path | None) -> None:
-    """Train one stage, resuming from ``run/checkpoint.pt`` when it exists."""
+def train(
+    config: TrainConfig,
+    records: Path,
+    run: Path,
+    *,
+    init: Path | None = None,
+    sitting: int | None = None,
+) -> None:
+    """Train one stage, resuming from ``run/checkpoint.pt`` when it exists.
+
+    Args:
+        config: the stage.
+        records: folder made by cvthead.training.prepare.
+        run: folder of the run.
+        init: checkpoint of an earlier stage, whose averaged weights are the start.
+        sitting: stop after this many steps, to go on another time; None runs to the end.
+    """
     torch.manual_seed(config.seed)
     torch.set_num_threads(2)
     run.mkdir(parents=True, exist_ok=True)
@@ -118,14 +133,15 @@ def train(config: TrainConfig, records: Path, run: Path, init: Path | None) -> N
         seed=config.seed + config.size,
         samples=config.steps * config.batch,
     )
-    rest = Subset(dataset, range(step * config.batch, len(dataset)))
+    first = step
+    last = config.steps if sitting is None else min(config.steps, first + sitting)
+    rest = Subset(dataset, range(first * config.batch, last * config.batch))
     loader = DataLoader(rest, config.batch, num_workers=1, prefetch_factor=4)
     log = (run / "log.jsonl").open("a")
     (run / "config.json").write_text(json.dumps(asdict(config), indent=2))
     running: dict[str, float] = {}
     model.train()
     saved = started = time.monotonic()
-    first = step
     for batch in loader:
         if step >= config.freeze_norm * config.steps:
             freeze_norms(model)
@@ -154,7 +170,7 @@ def train(config: TrainConfig, records: Path, run: Path, init: Path | None) -> N
                 name: round(value, 4) for name, value in running.items()
             }
             print(json.dumps(line), file=log, flush=True)
-        if time.monotonic() - saved > 300 or step == config.steps:
+        if time.monotonic() - saved > 300 or step == last:
             saved = time.monotonic()
             save(checkpoint, model, averaged, optimizer, step)
             save_picture(run / "samples.png", batch, rgb, logits)
@@ -197,8 +213,10 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=4)
     parser.add_argument("--learning-rate", type=float, default=5e-4)
     parser.add_argument("--init", type=Path, help="checkpoint of an earlier stage")
+    parser.add_argument("--sitting", type=int, help="stop after this many steps; resume later")
     a = parser.parse_args()
-    train(TrainConfig(a.size, a.steps, a.batch, a.learning_rate), a.records, a.run, a.init)
+    config = TrainConfig(a.size, a.steps, a.batch, a.learning_rate)
+    train(config, a.records, a.run, init=a.init, sitting=a.sitting)
 
 
 if __name__ == "__main__":
