@@ -2,25 +2,45 @@
 
 from __future__ import annotations
 
-import json
+import re
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL.JpegImagePlugin import JpegImageFile
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save as save_tensors
 
-from cvthead.camera import Camera, Crop
-from cvthead.coefficients import Coefficients
-from cvthead.deformation import Deformation
-from cvthead.errors import AvatarFileError, CVTHeadError
-from cvthead.files import atomic_path
+from cvthead.camera import CROP_PIXELS, Camera, Crop
+from cvthead.coefficients import EXPRESSION_SIZE, POSE_SIZE, SHAPE_SIZE, Coefficients
+from cvthead.deformation import MAX_SHELL_POINTS, Deformation
+from cvthead.errors import AvatarFileError, CoefficientsError
+from cvthead.files import write_file
+from cvthead.images import DAMAGE
 
 FORMAT = "cvthead-avatar"
 VERSION = "1"
+# Four times what the largest avatar needs.
+MAX_BYTES = 4 * 2**20
 CAMERA_FIELDS = ("scale", "tx", "ty")
 CROP_FIELDS = ("left", "top", "size")
+# Type (in safetensors' spelling) and shape of each array of a file. Letters stand for sizes that
+# differ from avatar to avatar: points, channels, vertices, shell points, bytes.
+ARRAYS: dict[str, tuple[str, tuple[int | str, ...]]] = {
+    "descriptors": ("F16", ("P", "C")),
+    "offsets": ("F16", ("N", 3)),
+    "shell_anchor": ("I32", ("K",)),
+    "shell_offset": ("F16", ("K", 3)),
+    "shape": ("F32", (SHAPE_SIZE,)),
+    "expression": ("F32", (EXPRESSION_SIZE,)),
+    "pose": ("F32", (POSE_SIZE,)),
+    "camera": ("F64", (len(CAMERA_FIELDS),)),
+    "crop": ("F64", (len(CROP_FIELDS),)),
+    "background": ("U8", ("B",)),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +68,11 @@ class Avatar:
     preset: str
     fingerprint: str
 
+    def __post_init__(self) -> None:
+        constant = self.descriptors.view()
+        constant.flags.writeable = False  # shared between threads
+        object.__setattr__(self, "descriptors", constant)
+
     def to_bytes(self) -> bytes:
         """One safetensors file of less than 1 MB."""
         tensors = {
@@ -58,7 +83,7 @@ class Avatar:
             "shape": self.coefficients.shape,
             "expression": self.coefficients.expression,
             "pose": self.coefficients.pose,
-            "camera": np.array([getattr(self.camera, f) for f in CAMERA_FIELDS]),
+            "camera": np.array([getattr(self.camera, f) for f in CAMERA_FIELDS], np.float64),
             "crop": np.array([getattr(self.crop, f) for f in CROP_FIELDS], np.float64),
             "background": np.frombuffer(self.background, np.uint8),
         }
@@ -72,48 +97,110 @@ class Avatar:
         return save_tensors(contiguous, metadata=metadata)
 
     def save(self, path: Path | str) -> None:
-        """Write the file; an existing one is replaced only when the new one is complete."""
-        with atomic_path(Path(path)) as temporary:
-            temporary.write_bytes(self.to_bytes())
+        """Write the file; an existing one is replaced only when the new one is complete.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        write_file(path, self.to_bytes())
 
     @classmethod
     def load(cls, path: Path | str) -> Avatar:
-        """Read a file written by :meth:`save`.
+        """Read a file written by :meth:`save`. The file may come from anywhere: types, shapes
+        and ranges are checked here, whether they fit the loaded head model by the Pipeline.
 
         Raises:
-            AvatarFileError: missing, truncated, not an avatar, or of another version.
+            AvatarFileError: missing, truncated, not an avatar, of another version, or with
+                contents that :meth:`save` does not write.
         """
         hint = "encode the portrait again with `cvthead encode`"
         try:
+            if Path(path).stat().st_size > MAX_BYTES:
+                raise ValueError(f"larger than {MAX_BYTES >> 20} MiB")
             with safe_open(str(path), framework="np") as file:
                 metadata = file.metadata() or {}
-                if metadata.get("format") != FORMAT:
-                    raise AvatarFileError(f"{path} is not an avatar file", hint=hint)
-                if metadata.get("version") != VERSION:
-                    raise AvatarFileError(
-                        f"{path} has format version {metadata.get('version')}, expected {VERSION}",
-                        hint=hint,
-                    )
-                t = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            return cls(
-                t["descriptors"],
-                Deformation(
-                    t["offsets"].astype(np.float32),
-                    t["shell_anchor"],
-                    t["shell_offset"].astype(np.float32),
-                ),
-                Coefficients(t["shape"], t["expression"], t["pose"]),
-                Camera(*t["camera"].tolist()),
-                Crop(*t["crop"].tolist()),
-                t["background"].tobytes(),
-                metadata["preset"],
-                metadata["fingerprint"],
-            )
+                _check_metadata(metadata)
+                _check_arrays(file)
+                arrays = {name: file.get_tensor(name) for name in ARRAYS}
+            return _avatar(arrays, metadata)
         except FileNotFoundError as error:
             raise AvatarFileError(f"{path} does not exist", hint=hint) from error
-        except (SafetensorError, KeyError, OSError, TypeError, json.JSONDecodeError) as error:
-            raise AvatarFileError(f"{path} is damaged: {error}", hint=hint) from error
-        except CVTHeadError as error:
-            if isinstance(error, AvatarFileError):
-                raise
-            raise AvatarFileError(f"{path} is damaged: {error}", hint=hint) from error
+        except (SafetensorError, OSError, ValueError, CoefficientsError) as error:
+            raise AvatarFileError(
+                f"{path} is damaged or not an avatar file: {error}", hint=hint
+            ) from error
+
+
+def _check_metadata(metadata: dict[str, str]) -> None:
+    if metadata.get("format") != FORMAT:
+        raise ValueError(f"its format is not {FORMAT}")
+    if metadata.get("version") != VERSION:
+        raise ValueError(f"format version {metadata.get('version')!r}, expected {VERSION}")
+    # Both are shown in messages.
+    for name, pattern in (("preset", "[a-z]{1,16}"), ("fingerprint", "[0-9a-f]{16}")):
+        if not re.fullmatch(pattern, metadata.get(name, "")):
+            raise ValueError(f"its {name} is missing or malformed")
+
+
+def _check_arrays(file: Any) -> None:
+    """Types and shapes, from the header alone: safetensors' reader fails on types that NumPy
+    lacks, and NumPy would broadcast wrong shapes or take indices from the other end."""
+    present = set(file.keys())
+    sizes: dict[str, int] = {}
+    for name, (kind, shape) in ARRAYS.items():
+        if name not in present:
+            raise ValueError(f"{name} is missing")
+        header = file.get_slice(name)
+        if header.get_dtype() != kind:
+            raise ValueError(f"{name} has type {header.get_dtype()}, expected {kind}")
+        found = header.get_shape()
+        wanted = [
+            size if isinstance(size, int) else sizes.setdefault(size, length)
+            for size, length in zip(shape, found, strict=False)
+        ]
+        if len(found) != len(shape) or found != wanted:
+            raise ValueError(f"{name} has shape {found}, expected {list(shape)}")
+    if sizes["K"] > MAX_SHELL_POINTS:
+        raise ValueError(f"{sizes['K']} shell points, at most {MAX_SHELL_POINTS} are possible")
+    if 0 in (sizes["N"], sizes["C"]) or sizes["N"] + sizes["K"] > sizes["P"]:
+        raise ValueError("fewer descriptors than vertices and shell points")
+
+
+def _avatar(arrays: dict[str, NDArray[Any]], metadata: dict[str, str]) -> Avatar:
+    for name in ("descriptors", "offsets", "shell_offset", "crop"):
+        if not np.isfinite(arrays[name]).all():
+            raise ValueError(f"{name} holds NaN or infinity")
+    anchor = arrays["shell_anchor"]
+    if ((anchor < 0) | (anchor >= len(arrays["offsets"]))).any():
+        raise ValueError("shell_anchor names a vertex that does not exist")
+    camera, crop = Camera(*arrays["camera"].tolist()), Crop(*arrays["crop"].tolist())
+    camera.check()
+    if crop.size <= 0:
+        raise ValueError(f"crop has size {crop.size:g}")
+    background = arrays["background"].tobytes()
+    _check_background(background)
+    return Avatar(
+        arrays["descriptors"],
+        Deformation(
+            arrays["offsets"].astype(np.float32), anchor, arrays["shell_offset"].astype(np.float32)
+        ),
+        Coefficients(arrays["shape"], arrays["expression"], arrays["pose"]),
+        camera,
+        crop,
+        background,
+        metadata["preset"],
+        metadata["fingerprint"],
+    )
+
+
+def _check_background(data: bytes) -> None:
+    """A whole RGB JPEG of the crop's size; the size is checked before a pixel is decoded."""
+    try:
+        with JpegImageFile(BytesIO(data)) as image:
+            size, mode = image.size, image.mode
+            if (*size, mode) == (CROP_PIXELS, CROP_PIXELS, "RGB"):
+                image.load()
+                return
+    except DAMAGE as error:
+        raise ValueError("background is not a JPEG picture") from error
+    raise ValueError(f"background is {size[0]} x {size[1]} px, {mode}")

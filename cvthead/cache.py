@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from cvthead.avatar import Avatar
-from cvthead.errors import AvatarExpiredError, AvatarNotFoundError
+from cvthead.errors import AvatarExpiredError, AvatarFileError, AvatarNotFoundError
 
 SUFFIX = ".avatar"
 # A tombstone lets an expired id be told apart from one that never was.
@@ -74,16 +74,20 @@ class AvatarCache:
             if key in self._memory:
                 self._memory.move_to_end(key)
                 return self._memory[key][0]
-        avatar = Avatar.load(path)
+        try:
+            avatar, size = Avatar.load(path), path.stat().st_size
+        except (AvatarFileError, FileNotFoundError):
+            self._check(key, path)  # another thread may have deleted it meanwhile
+            raise
         with self._lock:
-            self._remember(key, avatar, path.stat().st_size)
+            self._remember(key, avatar, size)
+        self._check(key, path)  # the same: it must not stay in memory then
         return avatar
 
     def expires(self, key: str) -> float | None:
         """When the avatar expires, in seconds since the epoch."""
-        path = self._path(key)
-        self._check(key, path)
-        return None if self.lifetime is None else path.stat().st_mtime + self.lifetime
+        written = self._check(key, self._path(key))
+        return None if self.lifetime is None else written + self.lifetime
 
     def delete(self, key: str) -> None:
         """Remove an avatar from memory and folder.
@@ -93,15 +97,15 @@ class AvatarCache:
         """
         path = self._path(key)
         self._check(key, path)
-        self._forget(key)
         path.unlink(missing_ok=True)
+        self._forget(key)
 
     def ids(self) -> Iterator[str]:
         """Ids of the stored avatars that have not expired, oldest first."""
-        files = sorted(self.folder.glob(f"*{SUFFIX}"), key=lambda p: p.stat().st_mtime)
-        for path in files:
-            if ID_PATTERN.fullmatch(path.stem) and not self._expired(path):
-                yield path.stem
+        files = [(_written(path), path.stem) for path in self.folder.glob(f"*{SUFFIX}")]
+        for written, key in sorted((w, k) for w, k in files if w is not None):
+            if ID_PATTERN.fullmatch(key) and not self._expired(written):
+                yield key
 
     @property
     def used_bytes(self) -> int:
@@ -114,20 +118,21 @@ class AvatarCache:
             raise AvatarNotFoundError("no such avatar", hint="ids are 32 hexadecimal digits")
         return self.folder / f"{key}{SUFFIX}"
 
-    def _expired(self, path: Path) -> bool:
-        return self.lifetime is not None and path.stat().st_mtime + self.lifetime <= self._clock()
+    def _expired(self, written: float) -> bool:
+        return self.lifetime is not None and written + self.lifetime <= self._clock()
 
-    def _check(self, key: str, path: Path) -> None:
+    def _check(self, key: str, path: Path) -> float:
+        """When the avatar was stored; an expired one is removed. Errors as :meth:`get`."""
         tombstone = path.with_suffix(TOMBSTONE)
-        if path.exists() and self._expired(path):
+        written = _written(path)
+        if written is not None and not self._expired(written):
+            return written
+        if written is not None:
             tombstone.touch()
             path.unlink(missing_ok=True)
-            self._forget(key)
-        if path.exists():
-            return
+        self._forget(key)
         if tombstone.exists():
             raise AvatarExpiredError("the avatar has expired", hint="upload the portrait again")
-        self._forget(key)
         raise AvatarNotFoundError("no such avatar", hint="upload the portrait first")
 
     def _remember(self, key: str, avatar: Avatar, size: int) -> None:
@@ -142,3 +147,11 @@ class AvatarCache:
         with self._lock:
             if key in self._memory:
                 self._used -= self._memory.pop(key)[1]
+
+
+def _written(path: Path) -> float | None:
+    """Seconds since the epoch; None if there is no such file (any more)."""
+    try:
+        return path.stat().st_mtime
+    except FileNotFoundError:
+        return None

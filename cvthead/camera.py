@@ -13,7 +13,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cvthead.coefficients import checked
+from cvthead.errors import CoefficientsError
+
 CROP_PIXELS = 256
+# Far beyond any picture, and far from where float32 projections overflow.
+CAMERA_LIMIT = 1e6
 
 
 @dataclass(frozen=True)
@@ -30,6 +35,16 @@ class Camera:
     scale: float
     tx: float
     ty: float
+
+    def check(self) -> None:
+        """Refuse a camera that cannot project.
+
+        Raises:
+            CoefficientsError: NaN, infinite, beyond +-CAMERA_LIMIT, or a scale not above 0.
+        """
+        scale = checked("camera", (self.scale, self.tx, self.ty), 3, CAMERA_LIMIT)[0]
+        if scale <= 0:
+            raise CoefficientsError(f"camera has scale {self.scale:g}", hint="use one above 0")
 
     def project(self, vertices: NDArray[np.floating]) -> NDArray[np.float32]:
         """(..., 3) head-model vertices in metres -> (..., 3) image x, y and depth."""
@@ -67,8 +82,12 @@ class Crop:
         zoom = pixels / self.size
         # Shrinking by warpAffine alone aliases, so shrink the covered part first.
         if zoom < 0.75:
-            image_small = cv2.resize(image, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_AREA)
-            fx, fy = image_small.shape[1] / image.shape[1], image_small.shape[0] / image.shape[0]
+            height, width = image.shape[:2]
+            # A whole size, not fx and fy: given those, resize scales by them exactly, which is
+            # not the ratio of the sizes, and the far side of a large picture shifts by a pixel.
+            small = max(1, round(width * zoom)), max(1, round(height * zoom))
+            image_small = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
+            fx, fy = small[0] / width, small[1] / height
         else:
             image_small, fx, fy = image, 1.0, 1.0
         zx, zy = zoom / fx, zoom / fy

@@ -25,7 +25,8 @@ def checked(name: str, values: ArrayLike, size: int, limit: float) -> Array:
         CoefficientsError: not numbers, wrong length, NaN or infinite, beyond the limit.
     """
     try:
-        array = np.array(values, dtype=np.float32)
+        with np.errstate(over="ignore"):  # becomes infinite, which is refused below
+            array = np.array(values, dtype=np.float32)
     except (TypeError, ValueError, OverflowError) as error:
         raise CoefficientsError(
             f"{name} is not a list of numbers", hint=f"send {size} numbers"

@@ -35,12 +35,13 @@ class Controls:
         arkit: ARKit blendshape name -> 0..1. Adds its expression and replaces jaw and eye
             rotations that are not given here. In absolute mode it starts from the neutral
             expression unless ``expression`` is given.
-        camera: normalised weak-perspective camera.
+        camera: normalised weak-perspective camera; replaces the source's in both modes.
         mode: "absolute" replaces the source's values, "relative" adds to them (rotations are
             composed, the control's after the source's).
 
     Raises:
-        CoefficientsError: wrong length, NaN, out of range, unknown ARKit name or mode.
+        CoefficientsError: wrong length, NaN, out of range or unknown mode. ARKit names and
+            weights are checked by :func:`resolve`.
     """
 
     shape: ArrayLike | None = None
@@ -67,6 +68,8 @@ class Controls:
             value = getattr(self, name)
             if value is not None:
                 object.__setattr__(self, name, checked(name, value, size, limit))
+        if self.camera is not None:
+            self.camera.check()
 
     def rotations(self) -> dict[str, NDArray[np.float32]]:
         """The rotations that were given, by the joint's name in JOINTS."""

@@ -47,6 +47,12 @@ class Deformation:
     shell_anchor: NDArray[np.int32]
     shell_offset: Array
 
+    def __post_init__(self) -> None:
+        for name in self.__dataclass_fields__:
+            constant = getattr(self, name).view()
+            constant.flags.writeable = False  # an avatar's is shared between threads
+            object.__setattr__(self, name, constant)
+
     @classmethod
     def none(cls, head: HeadModel) -> Deformation:
         """The bald head: no displacement, no shell."""

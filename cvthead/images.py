@@ -39,7 +39,7 @@ _UPRIGHT = {
     8: Image.Transpose.ROTATE_90,
 }
 # What Pillow's readers raise for damaged data; MemoryError comes from absurd chunk lengths.
-_DAMAGE = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error, MemoryError)
+DAMAGE = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error, MemoryError)
 
 
 def read_image(path: Path | str) -> NDArray[np.uint8]:
@@ -98,7 +98,7 @@ def decode_image(data: bytes) -> NDArray[np.uint8]:
             _check_size(*image.size)
             image.load()
             return _rgb(image)
-    except _DAMAGE as error:
+    except DAMAGE as error:
         raise ImageError(
             f"the {kind.upper()} file is truncated or damaged ({error})",
             hint="Export or download the picture again.",
@@ -254,7 +254,7 @@ def _rgb(image: Image.Image) -> NDArray[np.uint8]:
 def _orientation(image: Image.Image) -> int:
     try:
         return int(image.getexif().get(_EXIF_ORIENTATION, 1))
-    except (*_DAMAGE, TypeError, KeyError, IndexError):
+    except (*DAMAGE, TypeError, KeyError, IndexError):
         return 1  # a picture is worth reading without its EXIF data
 
 
@@ -270,6 +270,6 @@ def _srgb(image: Image.Image, profile: object) -> Image.Image:
         converted = ImageCms.profileToProfile(
             image, source, ImageCms.createProfile("sRGB"), outputMode=mode
         )
-    except (ImageCms.PyCMSError, *_DAMAGE):
+    except (ImageCms.PyCMSError, *DAMAGE):
         return image
     return converted or image

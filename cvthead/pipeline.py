@@ -19,7 +19,7 @@ from cvthead.camera import CROP_PIXELS, Camera
 from cvthead.coefficients import Coefficients
 from cvthead.controls import Controls, resolve
 from cvthead.deformation import DeformationModel
-from cvthead.errors import AssetError, ModelChangedError
+from cvthead.errors import AssetError, AvatarFileError, ModelChangedError
 from cvthead.frame import Frame
 from cvthead.head.arkit import ArkitMap
 from cvthead.head.hierarchy import MeshHierarchy
@@ -96,6 +96,7 @@ class Pipeline:
             deform: False skips hair and shoulders (the paper's ablation without deformation).
 
         Raises:
+            ImageError: not an (H, W, 3) uint8 array.
             FaceError: no face, several, too small, turned away.
         """
         tracked = self.tracker.track(image, face=face, only_one=only_one)
@@ -131,6 +132,7 @@ class Pipeline:
 
         Raises:
             ModelChangedError: the avatar was made with other trained weights.
+            AvatarFileError: its arrays do not fit the head model.
             CoefficientsError: an unknown ARKit name or a value out of range.
         """
         coefficients, camera = resolve(
@@ -144,7 +146,7 @@ class Pipeline:
         """Render full coefficients seen by a normalised camera.
 
         Raises:
-            ModelChangedError: the avatar was made with other trained weights.
+            ModelChangedError, AvatarFileError: as :meth:`render`.
         """
         return self.paint(avatar, self.pose(avatar, coefficients, camera))
 
@@ -152,18 +154,14 @@ class Pipeline:
         self, avatar: Avatar, coefficients: Coefficients, camera: Camera
     ) -> NDArray[np.float32]:
         """Driven point projections (P, 3): head model, skinning, camera."""
+        self._check(avatar)
         points = driven_points(self.head, self.layout, coefficients, avatar.deformation, camera)
         return points[: len(avatar.descriptors)]
 
     @torch.inference_mode()
     def paint(self, avatar: Avatar, points: NDArray[np.float32]) -> Frame:
         """Splat and U-Net (paper section 3.4)."""
-        if avatar.fingerprint != self.fingerprint:
-            raise ModelChangedError(
-                f"the avatar was made with weights {avatar.fingerprint}, "
-                f"this model has {self.fingerprint}",
-                hint="encode the portrait again",
-            )
+        self._check(avatar)
         rgb, logits = self.model.paint(
             torch.from_numpy(points)[None],
             torch.from_numpy(avatar.descriptors.astype(np.float32))[None],
@@ -172,6 +170,30 @@ class Pipeline:
         colour = ((rgb[0] + 1) * 127.5).round().byte().permute(1, 2, 0).contiguous()
         alpha = (logits[0, 0].sigmoid() * 255).round().byte()
         return Frame(colour.numpy(), alpha.numpy())
+
+    def _check(self, avatar: Avatar) -> None:
+        """Refuse an avatar of other weights, or one whose arrays do not fit (a forged file)."""
+        hint = "encode the portrait again"
+        if avatar.fingerprint != self.fingerprint:
+            raise ModelChangedError(
+                f"the avatar was made with weights {avatar.fingerprint}, "
+                f"this model has {self.fingerprint}",
+                hint=hint,
+            )
+        points = self.layout.surface + len(avatar.deformation.shell_anchor)
+        expected = {
+            "descriptors": (points, self.model.config.descriptor_size),
+            "offsets": (self.layout.vertices, 3),
+        }
+        found = {
+            "descriptors": avatar.descriptors.shape,
+            "offsets": avatar.deformation.offsets.shape,
+        }
+        for name, shape in expected.items():
+            if found[name] != shape:
+                raise AvatarFileError(
+                    f"the avatar's {name} have shape {found[name]}, expected {shape}", hint=hint
+                )
 
     def background(self, avatar: Avatar) -> NDArray[np.uint8]:
         """(256, 256, 3) uint8 RGB: the portrait's crop with the person painted away."""

@@ -1,49 +1,13 @@
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import numpy as np
 import pytest
+from made_avatars import made_avatar, same
 
-from cvthead.avatar import Avatar
 from cvthead.cache import AvatarCache
-from cvthead.camera import Camera, Crop
-from cvthead.coefficients import Coefficients
-from cvthead.deformation import Deformation
 from cvthead.errors import AvatarExpiredError, AvatarFileError, AvatarNotFoundError
-
-
-def made_avatar(seed: int = 0, points: int = 50) -> Avatar:
-    rng = np.random.default_rng(seed)
-    return Avatar(
-        rng.normal(size=(points, 24)).astype(np.float16),
-        Deformation(
-            rng.normal(size=(30, 3)).astype(np.float16).astype(np.float32),
-            rng.integers(0, 30, 7).astype(np.int32),
-            rng.normal(size=(7, 3)).astype(np.float16).astype(np.float32),
-        ),
-        Coefficients.zeros(),
-        Camera(5.5, 0.01, -0.02),
-        Crop(3.0, 4.0, 200.0),
-        b"jpeg bytes",
-        "open",
-        f"{seed:016x}",
-    )
-
-
-def same(a: Avatar, b: Avatar) -> bool:
-    # Not the bytes of the files: safetensors orders its metadata at random.
-    return plain(a) == plain(b) and all(map(np.array_equal, arrays(a), arrays(b)))
-
-
-def plain(a: Avatar) -> tuple[object, ...]:
-    return a.camera, a.crop, a.background, a.preset, a.fingerprint
-
-
-def arrays(a: Avatar) -> tuple[np.ndarray, ...]:
-    d, c = a.deformation, a.coefficients
-    shell = d.shell_anchor, d.shell_offset
-    return a.descriptors, d.offsets, *shell, c.shape, c.expression, c.pose
 
 
 class Clock:
@@ -124,3 +88,28 @@ def test_damaged_file_is_named(tmp_path: Path, keep: int) -> None:
     file.write_bytes(file.read_bytes()[:keep])
     with pytest.raises(AvatarFileError, match=key):
         AvatarCache(tmp_path).get(key)
+
+
+def test_threads_share_one_cache(tmp_path: Path) -> None:
+    """Readers and deleters at once see an avatar or "not found", never another error."""
+    size = len(made_avatar().to_bytes())
+    cache = AvatarCache(tmp_path, memory_bytes=2 * size)  # so that most reads go to the folder
+    keys = [cache.put(made_avatar(i)) for i in range(12)]
+
+    def read(number: int) -> bool:
+        try:
+            return same(cache.get(keys[number % len(keys)]), made_avatar(number % len(keys)))
+        except AvatarNotFoundError:
+            return number % len(keys) >= 6
+
+    def delete(key: str) -> bool:
+        cache.delete(key)
+        return len(list(cache.ids())) <= len(keys)
+
+    with ThreadPoolExecutor(8) as pool:
+        reads = [pool.submit(read, n) for n in range(240)]
+        deletions = [pool.submit(delete, key) for key in keys[6:]]
+        reads += [pool.submit(read, n) for n in range(240)]
+    assert all(task.result() for task in reads + deletions)
+    assert sorted(cache.ids()) == sorted(keys[:6])
+    assert cache.used_bytes <= 2 * size + 64

@@ -18,14 +18,9 @@ from cvthead.images import encode_image, read_image
 from cvthead.provenance import SourceType, read_mark
 from cvthead.video import probe_video, read_frames
 from cvthead.video_writer import video_writer
-from cvthead.weights import packaged_weights
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PORTRAIT = EXAMPLES / "astronaut.png"
-
-trained = pytest.mark.skipif(
-    not packaged_weights("open").is_file(), reason="the package holds no trained weights"
-)
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +67,6 @@ PICTURES = {
 }
 
 
-@trained
 @pytest.mark.parametrize("command", ["encode", "animate", "track", "sweep"])
 @pytest.mark.parametrize("kind", PICTURES)
 def test_bad_picture(
@@ -89,7 +83,6 @@ def test_bad_picture(
     assert message in refused(arguments, capsys, remains={"in.png"}, folder=tmp_path)
 
 
-@trained
 def test_no_face(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rng = np.random.default_rng(0)
     noise = rng.integers(0, 256, (300, 300, 3), dtype=np.uint8)
@@ -98,7 +91,6 @@ def test_no_face(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "no face" in refused(arguments, capsys, remains={"noise.png"}, folder=tmp_path)
 
 
-@trained
 def test_several_faces_are_named_with_their_places(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -114,7 +106,6 @@ def test_several_faces_are_named_with_their_places(
     assert main(["encode", picture, "--face", "1", "-o", output]) == 0
 
 
-@trained
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -151,7 +142,6 @@ def test_bad_coefficients_and_options(
     assert message in refused(arguments, capsys, remains=set(), folder=tmp_path)
 
 
-@trained
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -176,7 +166,6 @@ def test_bad_motion_file(
     assert message in refused(arguments, capsys, remains={"motion.json"}, folder=tmp_path)
 
 
-@trained
 def test_unwritable_output(
     avatar: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -192,7 +181,6 @@ def test_unwritable_output(
     assert [path.name for path in full.iterdir()] == ["kept.txt"]
 
 
-@trained
 def test_damaged_avatar_keeps_the_earlier_picture(
     avatar: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -204,7 +192,6 @@ def test_damaged_avatar_keeps_the_earlier_picture(
     assert picture.read_bytes() == b"earlier"
 
 
-@trained
 def test_transparent_needs_a_format_with_alpha(
     avatar: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -218,7 +205,6 @@ def test_official_preset_is_refused(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "official" in refused(arguments, capsys, remains=set(), folder=tmp_path)
 
 
-@trained
 def test_encode_without_deformation(avatar: Path, tmp_path: Path) -> None:
     bald = tmp_path / "bald.avatar"
     assert main(["encode", str(PORTRAIT), "--no-deformation", "-o", str(bald)]) == 0
@@ -226,7 +212,6 @@ def test_encode_without_deformation(avatar: Path, tmp_path: Path) -> None:
     assert Avatar.load(avatar).deformation.offsets.any()
 
 
-@trained
 def test_render_backgrounds_and_sizes(avatar: Path, tmp_path: Path) -> None:
     def rendered(name: str, *options: str) -> bytes:
         path = tmp_path / name
@@ -249,7 +234,6 @@ def test_render_backgrounds_and_sizes(avatar: Path, tmp_path: Path) -> None:
     assert np.abs(clear - read_image(tmp_path / "large.png")).mean() < 1
 
 
-@trained
 def test_render_forms_of_coefficients_agree(avatar: Path, tmp_path: Path) -> None:
     expression = Avatar.load(avatar).coefficients.expression.tolist()
     expression[3] = -1.5
@@ -270,7 +254,6 @@ def test_render_forms_of_coefficients_agree(avatar: Path, tmp_path: Path) -> Non
         np.testing.assert_array_equal(picture, pictures[0])
 
 
-@trained
 def test_render_accepts_a_value_that_starts_with_minus(avatar: Path, tmp_path: Path) -> None:
     spaced, joined = tmp_path / "a.png", tmp_path / "b.png"
     assert main(["render", str(avatar), "--global", "-0.1,0.4,0", "-o", str(spaced)]) == 0
@@ -281,7 +264,6 @@ def test_render_accepts_a_value_that_starts_with_minus(avatar: Path, tmp_path: P
     assert np.abs(read_image(spaced).astype(int) - read_image(plain)).mean() > 0.5
 
 
-@trained
 def test_track_report_drives_an_animation(
     avatar: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -310,7 +292,6 @@ def motion(folder: Path, frames: int) -> Path:
     return path
 
 
-@trained
 @pytest.mark.parametrize("name", ["out.mp4", "out.gif", "out.png", "frames/"])
 def test_animate_formats(name: str, avatar: Path, tmp_path: Path) -> None:
     output = tmp_path / name
@@ -327,7 +308,6 @@ def test_animate_formats(name: str, avatar: Path, tmp_path: Path) -> None:
     assert len(list(read_frames(output))) == 3
 
 
-@trained
 def test_animate_by_a_video(
     avatar: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -345,7 +325,6 @@ def test_animate_by_a_video(
     np.testing.assert_allclose(times, [0, 0.1, 0.2, 0.3], atol=1e-3)
 
 
-@trained
 def test_video_without_a_face_leaves_nothing(
     avatar: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -359,7 +338,6 @@ def test_video_without_a_face_leaves_nothing(
     assert "no frame" in message
 
 
-@trained
 def test_relative_needs_motion(
     avatar: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -368,7 +346,6 @@ def test_relative_needs_motion(
     assert "motion" in refused(arguments, capsys, remains=set(), folder=tmp_path)
 
 
-@trained
 def test_sweep_cells_differ(avatar: Path, tmp_path: Path) -> None:
     output = tmp_path / "sweep.png"
     assert main(["sweep", str(avatar), "--cell", "64", "-o", str(output)]) == 0
@@ -379,7 +356,6 @@ def test_sweep_cells_differ(avatar: Path, tmp_path: Path) -> None:
     assert read_mark(output.read_bytes()) == SourceType.GENERATED
 
 
-@trained
 def test_bench_names_every_stage(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", str(PORTRAIT), "--renders", "2"]) == 0
     printed = capsys.readouterr().out

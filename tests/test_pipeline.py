@@ -130,6 +130,22 @@ def test_other_weights_are_refused(pipeline: Pipeline, avatar: AvatarType) -> No
         pipeline.render(replace(avatar, fingerprint="0123456789abcdef"))
 
 
+def test_forged_arrays_are_refused(pipeline: Pipeline, avatar: AvatarType) -> None:
+    whole = avatar.deformation
+    for forged in (
+        replace(avatar, descriptors=avatar.descriptors[:-1]),
+        replace(avatar, descriptors=avatar.descriptors[:, :-1]),
+        # NumPy would broadcast it over all vertices.
+        replace(avatar, deformation=replace(whole, offsets=whole.offsets[:1])),
+        replace(avatar, deformation=replace(whole, offsets=whole.offsets[:-1])),
+    ):
+        with pytest.raises(AvatarFileError, match="expected"):
+            pipeline.render(forged)
+        # Another model's avatar may have any shape; its weights are what is wrong with it.
+        with pytest.raises(ModelChangedError):
+            pipeline.render(replace(forged, fingerprint="0123456789abcdef"))
+
+
 def test_deformation_can_be_left_out(pipeline: Pipeline, portrait: NDArray[np.uint8]) -> None:
     bald = pipeline.encode(portrait, deform=False)
     assert not bald.deformation.offsets.any()

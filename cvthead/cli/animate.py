@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from itertools import islice
 from pathlib import Path
 
 from tqdm import tqdm
@@ -77,7 +76,8 @@ def run(args: argparse.Namespace) -> None:
     drive = open_driver(args.driving, pipeline, avatar, options)
     composer = Composer.of(args.background, args.size, pipeline.background(avatar))
     if drive.count == 1 and args.output.suffix.lower() in IMAGE_FORMATS:
-        step = next(islice(drive.steps, 1))
+        # All of them, for a video whose only frame shows no face says so after it.
+        step = list(drive.steps)[0]  # noqa: RUF015
         frame = pipeline.render_coefficients(avatar, step.coefficients, step.camera)
         write_picture(args.output, composer.picture(frame), composer.source)
     else:

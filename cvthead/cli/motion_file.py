@@ -89,10 +89,7 @@ def _controls(index: int, frame: Any, mode: Mode, camera: bool) -> Controls:
             )
         fields["arkit"] = {k: number(f"{place} {k}", v) for k, v in frame["arkit"].items()}
     if camera and "camera" in frame:
-        scale, tx, ty = listed(f"{place} camera", frame["camera"], 3).tolist()
-        if scale <= 0:
-            raise CoefficientsError(f"{place} camera has scale {scale:g}", hint="use one above 0")
-        fields["camera"] = Camera(scale, tx, ty)
+        fields["camera"] = Camera(*listed(f"{place} camera", frame["camera"], 3).tolist())
     try:
         return Controls(**fields, mode=mode)
     except CoefficientsError as error:

@@ -88,7 +88,8 @@ def with_entries(
     """``start`` with the entries (index -> number) replaced."""
     result = start.copy()
     for key, value in entries.items():
-        if not key.isdecimal() or not int(key) < len(start):
+        # The length first: int() refuses thousands of digits with an error of its own.
+        if not (key.isdecimal() and len(key) < 10 and int(key) < len(start)):
             raise CoefficientsError(f"{name} has no index {key}", hint=f"use 0 to {len(start) - 1}")
         result[int(key)] = number(f"{name}[{key}]", value)
     return result

@@ -12,6 +12,7 @@ import argparse
 import json
 import math
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -65,6 +66,16 @@ def learning_rate(config: TrainConfig, step: int) -> float:
     )
 
 
+def averaging(decay: float) -> Callable[[Any, Any, Any], None]:
+    """Moving average whose window grows from nothing, so that a short run forgets its start."""
+
+    def update(averaged: Any, current: Any, count: Any) -> None:
+        rate = min(decay, (1 + int(count)) / (10 + int(count)))
+        torch.optim.swa_utils.get_ema_multi_avg_fn(rate)(averaged, current, count)  # type: ignore[no-untyped-call]
+
+    return update
+
+
 def freeze_norms(model: nn.Module) -> None:
     for module in model.modules():
         if isinstance(module, nn.BatchNorm2d):
@@ -93,7 +104,7 @@ def train(
         config: the stage.
         records: folder made by cvthead.training.prepare.
         run: folder of the run.
-        init: checkpoint of an earlier stage, whose averaged weights are the start.
+        init: checkpoint of an earlier stage, whose weights are the start.
         sitting: stop after this many steps, to go on another time; None runs to the end.
     """
     torch.manual_seed(config.seed)
@@ -105,7 +116,7 @@ def train(
     model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     averaged = torch.optim.swa_utils.AveragedModel(
         model,
-        multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(config.average),  # type: ignore[no-untyped-call]
+        multi_avg_fn=averaging(config.average),
         use_buffers=True,
     )
     optimizer = torch.optim.AdamW(
@@ -123,8 +134,8 @@ def train(
         step = state["step"]
     elif init is not None:
         state = torch.load(init, weights_only=True)
-        averaged.load_state_dict(state["averaged"])
-        model.load_state_dict(averaged.module.state_dict())
+        model.load_state_dict(state["model"])
+        averaged.module.load_state_dict(state["model"])
     dataset = PairDataset(
         records,
         head,
