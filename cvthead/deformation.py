@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 from cvthead.camera import CROP_PIXELS, Camera
 from cvthead.coefficients import Coefficients
 from cvthead.errors import AssetError, FaceError
+from cvthead.head.mesh import vertex_normals
 from cvthead.head.model import HeadModel, Region
 from cvthead.outline import OutlineModel
 from cvthead.silhouette import Mask, Points, distance_to_points, pixel_of, signed_distance
@@ -209,19 +210,3 @@ def inverse_rotations(head: HeadModel, coefficients: Coefficients) -> Array:
     joints = head.joints(head.rest(coefficients))
     rotations = head.transforms(coefficients.pose, joints)[:, :, :3].reshape(-1, 9)
     return np.asarray(np.linalg.inv((head.weights @ rotations).reshape(-1, 3, 3)))
-
-
-def vertex_normals(positions: Array, faces: NDArray[np.integer]) -> Array:
-    """Area-weighted unit normals (N, 3)."""
-    corners = positions[faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    count = len(positions)
-    total = np.stack(
-        [
-            np.bincount(faces.ravel(), np.repeat(normals[:, axis], 3), minlength=count)
-            for axis in range(3)
-        ],
-        axis=1,
-    )
-    length = np.linalg.norm(total, axis=1, keepdims=True) + 1e-12
-    return np.asarray(total / length, dtype=np.float32)

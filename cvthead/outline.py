@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
+from cvthead.head.mesh import edges
 from cvthead.head.model import HeadModel, Region
 from cvthead.silhouette import Mask, Points, pixel_of, rasterise, signed_distance
 
@@ -62,8 +63,7 @@ class OutlineModel:
         ears = head.region == Region.EARS
         free = np.flatnonzero(pulled | ears)
         faces = head.faces
-        pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-        pairs = np.unique(np.sort(pairs, axis=1), axis=0)
+        pairs = edges(faces)
         length = np.linalg.norm(head.template[pairs[:, 0]] - head.template[pairs[:, 1]], axis=1)
         weight = 1 / np.maximum(length.astype(np.float64), 2e-3)
         weight /= weight.mean()

@@ -18,7 +18,7 @@ from cvthead.avatar import Avatar
 from cvthead.camera import CROP_PIXELS, Camera
 from cvthead.coefficients import Coefficients
 from cvthead.controls import Controls, resolve
-from cvthead.deformation import DeformationModel
+from cvthead.deformation import MAX_SHELL_POINTS, DeformationModel
 from cvthead.errors import AssetError, AvatarFileError, ModelChangedError
 from cvthead.frame import Frame
 from cvthead.head.arkit import ArkitMap
@@ -26,7 +26,7 @@ from cvthead.head.hierarchy import MeshHierarchy
 from cvthead.head.model import HeadModel
 from cvthead.model.config import OPEN
 from cvthead.model.cvthead import CVTHead
-from cvthead.points import SHELL_POINTS, PointLayout
+from cvthead.points import PointLayout
 from cvthead.source import HeadCrop, Source, cut_head, driven_points, read_source
 from cvthead.tracking.tracker import Tracker
 from cvthead.weights import load_into, packaged_weights
@@ -117,7 +117,7 @@ class Pipeline:
     def describe(self, source: Source) -> NDArray[np.float16]:
         """(P, C) descriptors of a source, unused shell points left out."""
         shell = len(source.deformation.shell_anchor)
-        anchor = np.zeros(SHELL_POINTS, np.int64)
+        anchor = np.zeros(MAX_SHELL_POINTS, np.int64)
         anchor[:shell] = source.deformation.shell_anchor
         out = self.model.describe(
             torch.from_numpy(source.network_input)[None],

@@ -12,10 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cvthead.deformation import MAX_SHELL_POINTS
+from cvthead.head import mesh
 from cvthead.head.model import HeadModel, Region
 
 DETAIL_REGIONS = (Region.FACE, Region.EYES, Region.MOUTH)
-SHELL_POINTS = 512
 FAR_AWAY = np.array([-10.0, -10.0, 50.0], dtype=np.float32)
 
 
@@ -36,11 +37,8 @@ class PointLayout:
     @classmethod
     def of(cls, head: HeadModel) -> PointLayout:
         detail = np.isin(head.region, DETAIL_REGIONS)
-        sides = np.concatenate(
-            [head.faces[:, [0, 1]], head.faces[:, [1, 2]], head.faces[:, [2, 0]]]
-        )
-        sides = sides[detail[sides].all(1)]
-        edges = np.unique(np.sort(sides, axis=1), axis=0)
+        every = mesh.edges(head.faces)
+        edges = every[detail[every].all(1)]
         flipped = np.sort(head.mirror[edges], axis=1)
         number = {tuple(edge): i for i, edge in enumerate(edges.tolist())}
         # The mesh's diagonals need not be mirrored; such an edge answers for itself.
@@ -56,8 +54,8 @@ class PointLayout:
 
     @property
     def total(self) -> int:
-        """All points, shell included: N + D + SHELL_POINTS."""
-        return self.surface + SHELL_POINTS
+        """All points, shell included: N + D + MAX_SHELL_POINTS."""
+        return self.surface + MAX_SHELL_POINTS
 
     def arrange(self, points: NDArray[np.float32]) -> NDArray[np.float32]:
         """(N + K, 3) projected vertices and shell points -> (total, 3), unused shell far away."""

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cvthead.head.mesh import vertex_normals
 from cvthead.points import PointLayout
 
 # Coarse enough that neighbouring vertices close the surface between them.
@@ -65,17 +66,8 @@ def _facing(
     layout: PointLayout, faces: NDArray[np.int32], points: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
     vertices = points[: layout.vertices]
-    corner = vertices[faces]
     # In image axes (y down, depth away) an outward normal towards the camera has negative z.
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    total = np.zeros_like(vertices)
-    for k in range(3):
-        for axis in range(3):
-            total[:, axis] += np.bincount(
-                faces[:, k], weights=normal[:, axis], minlength=layout.vertices
-            )
-    length = np.linalg.norm(total, axis=1) + 1e-12
-    towards = -total[:, 2] / length
+    towards = -vertex_normals(vertices, faces)[:, 2]
     a, b = layout.edges.T
     facing = np.ones(layout.total, dtype=bool)
     facing[: layout.vertices] = towards > -GRAZING

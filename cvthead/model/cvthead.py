@@ -33,9 +33,7 @@ class CVTHead(nn.Module):
         super().__init__()
         self.config = config
         size = config.token_size
-        coarse = torch.from_numpy(hierarchy.down[0]).long()
-        for down in hierarchy.down[1:]:
-            coarse = coarse[torch.from_numpy(down).long()]
+        coarse = torch.from_numpy(hierarchy.coarse).long()
         for name, value in {
             "coarse": coarse,
             "edges": torch.from_numpy(layout.edges).long(),

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from cvthead.deformation import MAX_SHELL_POINTS
 from cvthead.head.model import HeadModel
-from cvthead.points import SHELL_POINTS, PointLayout
+from cvthead.points import PointLayout
 from cvthead.source import driven_points, network_input
 from cvthead.training.records import Frame, Record
 
@@ -76,7 +77,7 @@ class PairDataset(Dataset[dict[str, Tensor]]):
         source = record.frame(number)
         deformation = record.deformation(number)
         visible = record.visible(number, self.layout.total).astype(np.float32)
-        anchor = np.zeros(SHELL_POINTS, dtype=np.int64)
+        anchor = np.zeros(MAX_SHELL_POINTS, dtype=np.int64)
         anchor[: len(deformation.shell_anchor)] = deformation.shell_anchor
 
         def points(frame: Frame) -> Array:
