@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from functools import cached_property
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
+from PIL.ImageFile import ImageFile
 from PIL.JpegImagePlugin import JpegImageFile
+from PIL.PngImagePlugin import PngImageFile
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save as save_tensors
 
@@ -22,7 +26,7 @@ from cvthead.files import write_file
 from cvthead.images import DAMAGE
 
 FORMAT = "cvthead-avatar"
-VERSION = "1"
+VERSION = "2"
 # Four times what the largest avatar needs.
 MAX_BYTES = 4 * 2**20
 CAMERA_FIELDS = ("scale", "tx", "ty")
@@ -39,6 +43,7 @@ ARRAYS: dict[str, tuple[str, tuple[int | str, ...]]] = {
     "pose": ("F32", (POSE_SIZE,)),
     "camera": ("F64", (len(CAMERA_FIELDS),)),
     "crop": ("F64", (len(CROP_FIELDS),)),
+    "portrait": ("U8", ("D",)),
     "background": ("U8", ("B",)),
 }
 
@@ -48,8 +53,11 @@ class Avatar:
     """One encoded portrait. Immutable; the encoder never runs again for it.
 
     Attributes:
-        descriptors: (P, C) float16, in the order of the preset's PointLayout without the unused
-            shell points (paper section 3.3, V_F).
+        descriptors: (P, C + 3) float16, in the order of the preset's PointLayout without the
+            unused shell points: V_F of the paper's section 3.3, then the point's x and y in the
+            portrait and 1 where the portrait sees it.
+        portrait: (256, 256, 4) uint8, the cropped person: RGB multiplied by the mask (grey 128
+            where there is no person), then the mask.
         deformation: hair and shoulders, in rest space.
         coefficients: of the portrait.
         camera: of the portrait, in the crop's normalised coordinates.
@@ -60,6 +68,7 @@ class Avatar:
     """
 
     descriptors: NDArray[np.float16]
+    portrait: NDArray[np.uint8]
     deformation: Deformation
     coefficients: Coefficients
     camera: Camera
@@ -69,9 +78,17 @@ class Avatar:
     fingerprint: str
 
     def __post_init__(self) -> None:
-        constant = self.descriptors.view()
-        constant.flags.writeable = False  # shared between threads
-        object.__setattr__(self, "descriptors", constant)
+        for name in ("descriptors", "portrait"):
+            constant = getattr(self, name).view()
+            constant.flags.writeable = False  # shared between threads
+            object.__setattr__(self, name, constant)
+
+    @cached_property
+    def portrait_input(self) -> NDArray[np.float32]:
+        """(4, 256, 256) float32: the portrait as the network takes it, RGB in [-1, 1], mask."""
+        scale = np.array([2, 2, 2, 1], np.float32) / 255
+        image = self.portrait * scale - np.array([1, 1, 1, 0], np.float32)
+        return np.ascontiguousarray(image.transpose(2, 0, 1))
 
     def to_bytes(self) -> bytes:
         """One safetensors file of less than 1 MB."""
@@ -85,6 +102,7 @@ class Avatar:
             "pose": self.coefficients.pose,
             "camera": np.array([getattr(self.camera, f) for f in CAMERA_FIELDS], np.float64),
             "crop": np.array([getattr(self.crop, f) for f in CROP_FIELDS], np.float64),
+            "portrait": np.frombuffer(_to_png(self.portrait), np.uint8),
             "background": np.frombuffer(self.background, np.uint8),
         }
         metadata = {
@@ -178,9 +196,10 @@ def _avatar(arrays: dict[str, NDArray[Any]], metadata: dict[str, str]) -> Avatar
     if crop.size <= 0:
         raise ValueError(f"crop has size {crop.size:g}")
     background = arrays["background"].tobytes()
-    _check_background(background)
+    _picture("background", background, JpegImageFile, "RGB")
     return Avatar(
         arrays["descriptors"],
+        _picture("portrait", arrays["portrait"].tobytes(), PngImageFile, "RGBA"),
         Deformation(
             arrays["offsets"].astype(np.float32), anchor, arrays["shell_offset"].astype(np.float32)
         ),
@@ -193,14 +212,20 @@ def _avatar(arrays: dict[str, NDArray[Any]], metadata: dict[str, str]) -> Avatar
     )
 
 
-def _check_background(data: bytes) -> None:
-    """A whole RGB JPEG of the crop's size; the size is checked before a pixel is decoded."""
+def _to_png(image: NDArray[np.uint8]) -> bytes:
+    out = BytesIO()
+    Image.fromarray(image).save(out, "PNG", compress_level=3)
+    return out.getvalue()
+
+
+def _picture(name: str, data: bytes, kind: type[ImageFile], mode: str) -> NDArray[np.uint8]:
+    """A whole picture of the crop's size; the size is checked before a pixel is decoded."""
     try:
-        with JpegImageFile(BytesIO(data)) as image:
-            size, mode = image.size, image.mode
-            if (*size, mode) == (CROP_PIXELS, CROP_PIXELS, "RGB"):
+        with kind(BytesIO(data)) as image:
+            found = (*image.size, image.mode)
+            if found == (CROP_PIXELS, CROP_PIXELS, mode):
                 image.load()
-                return
+                return np.array(image)
     except DAMAGE as error:
-        raise ValueError("background is not a JPEG picture") from error
-    raise ValueError(f"background is {size[0]} x {size[1]} px, {mode}")
+        raise ValueError(f"{name} is not a {kind.format} picture") from error
+    raise ValueError(f"{name} is {found[0]} x {found[1]} px, {found[2]}")

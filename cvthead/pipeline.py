@@ -26,8 +26,16 @@ from cvthead.head.hierarchy import MeshHierarchy
 from cvthead.head.model import HeadModel
 from cvthead.model.config import OPEN
 from cvthead.model.cvthead import CVTHead
+from cvthead.model.pixel_aligned import PLACE_SIZE
 from cvthead.points import PointLayout
-from cvthead.source import HeadCrop, Source, cut_head, driven_points, read_source
+from cvthead.source import (
+    HeadCrop,
+    Source,
+    cut_head,
+    driven_points,
+    network_input,
+    read_source,
+)
 from cvthead.tracking.tracker import Tracker
 from cvthead.weights import load_into, packaged_weights
 
@@ -104,6 +112,7 @@ class Pipeline:
         source = read_source(self.deformer, self.layout, crop, deform=deform)
         return Avatar(
             self.describe(source),
+            portrait(crop),
             source.deformation,
             crop.coefficients,
             crop.camera,
@@ -115,7 +124,7 @@ class Pipeline:
 
     @torch.inference_mode()
     def describe(self, source: Source) -> NDArray[np.float16]:
-        """(P, C) descriptors of a source, unused shell points left out."""
+        """(P, C + 3) descriptors of a source, unused shell points left out."""
         shell = len(source.deformation.shell_anchor)
         anchor = np.zeros(MAX_SHELL_POINTS, np.int64)
         anchor[:shell] = source.deformation.shell_anchor
@@ -165,6 +174,7 @@ class Pipeline:
         rgb, logits = self.model.paint(
             torch.from_numpy(points)[None],
             torch.from_numpy(avatar.descriptors.astype(np.float32))[None],
+            torch.from_numpy(avatar.portrait_input)[None],
             CROP_PIXELS,
         )
         colour = ((rgb[0] + 1) * 127.5).round().byte().permute(1, 2, 0).contiguous()
@@ -182,7 +192,7 @@ class Pipeline:
             )
         points = self.layout.surface + len(avatar.deformation.shell_anchor)
         expected = {
-            "descriptors": (points, self.model.config.descriptor_size),
+            "descriptors": (points, self.model.config.descriptor_size + PLACE_SIZE),
             "offsets": (self.layout.vertices, 3),
         }
         found = {
@@ -200,6 +210,13 @@ class Pipeline:
         image = cv2.imdecode(np.frombuffer(avatar.background, np.uint8), cv2.IMREAD_COLOR_RGB)
         assert image is not None, "avatar files are checked when they are loaded"
         return image.astype(np.uint8)
+
+
+def portrait(crop: HeadCrop) -> NDArray[np.uint8]:
+    """(256, 256, 4) uint8 of the person alone, as :class:`Avatar` keeps it."""
+    rgb, mask = network_input(crop.image, crop.mask)[:3], crop.mask[..., None] * 255
+    image = np.concatenate([(rgb.transpose(1, 2, 0) + 1) * 127.5, mask], axis=-1)
+    return np.asarray(np.rint(image), np.uint8)
 
 
 def without_person(crop: HeadCrop) -> bytes:

@@ -19,10 +19,17 @@ def jpeg(size: int = 256, mode: str = "RGB") -> bytes:
     return out.getvalue()
 
 
+def png(size: int = 256, mode: str = "RGBA") -> bytes:
+    out = BytesIO()
+    Image.new(mode, (size, size)).save(out, "PNG")
+    return out.getvalue()
+
+
 def made_avatar(seed: int = 0, points: int = 50) -> Avatar:
     rng = np.random.default_rng(seed)
     return Avatar(
-        rng.normal(size=(points, 24)).astype(np.float16),
+        rng.normal(size=(points, 19)).astype(np.float16),
+        rng.integers(0, 256, (256, 256, 4)).astype(np.uint8),
         Deformation(
             rng.normal(size=(30, 3)).astype(np.float16).astype(np.float32),
             rng.integers(0, 30, 7).astype(np.int32),
@@ -49,4 +56,4 @@ def plain(a: Avatar) -> tuple[object, ...]:
 def arrays(a: Avatar) -> tuple[np.ndarray, ...]:
     d, c = a.deformation, a.coefficients
     shell = d.shell_anchor, d.shell_offset
-    return a.descriptors, d.offsets, *shell, c.shape, c.expression, c.pose
+    return a.descriptors, a.portrait, d.offsets, *shell, c.shape, c.expression, c.pose

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from made_avatars import arrays, jpeg, made_avatar, plain
+from made_avatars import arrays, jpeg, made_avatar, plain, png
 from safetensors.numpy import load, save
 
 from cvthead.avatar import MAX_BYTES, Avatar
@@ -17,7 +17,7 @@ from cvthead.errors import AvatarFileError
 
 METADATA = {
     "format": "cvthead-avatar",
-    "version": "1",
+    "version": "2",
     "preset": "open",
     "fingerprint": "0123456789abcdef",
 }
@@ -109,6 +109,10 @@ def test_arrays_cannot_be_changed() -> None:
             ({"background": np.frombuffer(data, np.uint8)}, "background is")
             for data in (b"", b"\xff\xd8\xff", jpeg()[:300], jpeg(64), jpeg(mode="L"))
         ),
+        *(
+            ({"portrait": np.frombuffer(data, np.uint8)}, "portrait is")
+            for data in (b"", b"\x89PNG", png()[:100], png(64), png(mode="RGB"), jpeg())
+        ),
     ],
 )
 def test_forged_contents_are_refused(changed: dict[str, Any], message: str, tmp_path: Path) -> None:
@@ -120,7 +124,7 @@ def test_forged_contents_are_refused(changed: dict[str, Any], message: str, tmp_
     ("changed", "message"),
     [
         ({"format": "other"}, "format"),
-        ({"version": "2"}, "version '2'"),
+        ({"version": "1"}, "version '1'"),
         ({"preset": "../../x"}, "preset"),
         ({"fingerprint": "\x1b[2J"}, "fingerprint"),
         ({"fingerprint": ""}, "fingerprint"),

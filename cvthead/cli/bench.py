@@ -18,6 +18,7 @@ from cvthead.cli.portrait import add_portrait_options
 from cvthead.controls import Controls, resolve
 from cvthead.errors import InputError
 from cvthead.images import read_image
+from cvthead.model.cvthead import to_flow
 from cvthead.model.splat import splat
 from cvthead.pipeline import Pipeline, without_person
 from cvthead.source import cut_head, read_source
@@ -89,12 +90,15 @@ def _render_table(pipeline: Pipeline, avatar: Avatar, count: int) -> str:
     watch = Stopwatch()
     model = pipeline.model
     descriptors = torch.from_numpy(avatar.descriptors.astype(np.float32))[None]
+    portrait = torch.from_numpy(avatar.portrait_input)[None]
     for index in range(WARM_UP + count):
         turn = index / (WARM_UP + count) - 0.5
         controls = Controls(global_rotation=(0, turn, 0), arkit={"jawOpen": abs(turn)})
         points = watch.time("pose", _points, pipeline, avatar, controls)
-        image = watch.time("splat", splat, points, descriptors, CROP_PIXELS)
-        watch.time("U-Net", model.unet, image.contiguous(memory_format=torch.channels_last))
+        rows = to_flow(descriptors, points)
+        size = CROP_PIXELS // model.config.unet_unshuffle
+        image = watch.time("splat", splat, points, rows, size)
+        watch.time("warp and U-Net", model.paint_splat, image, portrait)
         frame = watch.time("all of render", pipeline.render, avatar, controls)
         watch.time("composite on colour", frame.over, (255, 255, 255))
     return watch.table(f"Once per frame (median of {count})", skipped=WARM_UP)

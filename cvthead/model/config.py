@@ -24,7 +24,7 @@ class ModelConfig:
         pixel_aligned_size: channels sampled at each point's projection; 0 leaves the branch out.
         point_embedding_size: learned channels per mesh vertex in the pixel-aligned branch.
         unet_sizes: widths of the U-Net from the finest level to the coarsest.
-        unet_unshuffle: the U-Net works at 1/unet_unshuffle of the image size.
+        unet_unshuffle: splat and U-Net work at 1/unet_unshuffle of the image size.
     """
 
     image_size: int
@@ -60,7 +60,7 @@ PAPER = ModelConfig(
 
 OPEN = ModelConfig(
     image_size=256,
-    descriptor_size=24,
+    descriptor_size=16,
     token_size=128,
     token_grid=16,
     depth=4,
@@ -70,6 +70,6 @@ OPEN = ModelConfig(
     encoder="pyramid",
     pixel_aligned_size=24,
     point_embedding_size=12,
-    unet_sizes=(64, 80, 128, 192),
+    unet_sizes=(48, 64, 96, 160, 192),
     unet_unshuffle=2,
 )

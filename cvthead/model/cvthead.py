@@ -7,14 +7,19 @@ from torch import Tensor, nn
 
 from cvthead.head.hierarchy import MeshHierarchy
 from cvthead.model.config import ModelConfig
+from cvthead.model.fill import fill
 from cvthead.model.light_unet import LightUNet
-from cvthead.model.pixel_aligned import PixelAlignedFusion
+from cvthead.model.pixel_aligned import PLACE_SIZE, PixelAlignedFusion
 from cvthead.model.positional import image_code, vertex_code
 from cvthead.model.pyramid_encoder import PyramidEncoder
 from cvthead.model.spiral import SpiralUpsampler
-from cvthead.model.splat import splat
+from cvthead.model.splat import EMPTY_DEPTH, splat
 from cvthead.model.transformer import Transformer
+from cvthead.model.warp import dense_flow, warp
 from cvthead.points import PointLayout
+
+FILL_LEVELS = 3
+CHANNELS_LAST = torch.channels_last
 
 
 class CVTHead(nn.Module):
@@ -52,7 +57,9 @@ class CVTHead(nn.Module):
             config.point_embedding_size,
             config.descriptor_size,
         )
-        self.unet = LightUNet(1 + config.descriptor_size, config.unet_sizes, config.unet_unshuffle)
+        # Depth, descriptor, seen and the coverage of each level.
+        size_in = 1 + config.descriptor_size + 1 + FILL_LEVELS
+        self.unet = LightUNet(size_in, config.unet_sizes, config.unet_unshuffle)
 
     def describe(self, source: Tensor, points: Tensor, visible: Tensor, anchor: Tensor) -> Tensor:
         """Point descriptors of a source image (paper section 3.3).
@@ -64,7 +71,7 @@ class CVTHead(nn.Module):
             anchor: (b, shell) vertex that each shell point hangs on.
 
         Returns:
-            (b, p, C) float32.
+            (b, p, C + 3) float32: descriptors and each point's place in the portrait.
         """
         tokens, pixels = self.encoder(source)
         query = self.vertex_query + vertex_code(points[:, self.coarse], self.config.token_size)
@@ -88,17 +95,47 @@ class CVTHead(nn.Module):
         shell = vertex.gather(1, anchor[..., None].expand(-1, -1, vertex.shape[-1]))
         return torch.cat([vertex, middle, shell], dim=1)
 
-    def paint(self, points: Tensor, descriptors: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    def paint(
+        self, points: Tensor, descriptors: Tensor, portrait: Tensor, size: int
+    ) -> tuple[Tensor, Tensor]:
         """Neural vertex rendering (paper section 3.4).
 
         Args:
             points: (b, p, 3) normalised driven projections.
-            descriptors: (b, p, C).
-            size: output height and width, a multiple of 16.
+            descriptors: (b, p, C + 3) from :meth:`describe`.
+            portrait: (b, 4, 256, 256), the source as given to :meth:`describe`.
+            size: output height and width, a multiple of 32.
 
         Returns:
             RGB (b, 3, size, size) in [-1, 1] and mask logits (b, 1, size, size).
         """
-        image = splat(points, descriptors, size)
-        out = self.unet(image.contiguous(memory_format=torch.channels_last)).float()
-        return torch.tanh(out[:, :3]), out[:, 3:]
+        rows = to_flow(descriptors, points)
+        return self.paint_splat(splat(points, rows, size // self.config.unet_unshuffle), portrait)
+
+    def paint_splat(self, image: Tensor, portrait: Tensor) -> tuple[Tensor, Tensor]:
+        """The network half of :meth:`paint`, without the splat.
+
+        Args:
+            image: (b, 1 + C + 3, s, s) splat of descriptors after :func:`to_flow`.
+            portrait: (b, 4, 256, 256).
+        """
+        with torch.autocast(image.device.type, enabled=False):
+            covered = (image[:, :1] > EMPTY_DEPTH).float()
+            flow, seen = image[:, -3:-1], image[:, -1:]
+            flow = dense_flow(flow, seen, image.shape[-1] * self.unet.unshuffle)
+            warped = warp(portrait, flow)
+            dense, coverage = fill(
+                image[:, : 1 + self.config.descriptor_size], covered, FILL_LEVELS
+            )
+        x = torch.cat([dense, seen, *coverage], dim=1)
+        out: tuple[Tensor, Tensor] = self.unet(x.contiguous(memory_format=CHANNELS_LAST), warped)
+        return out
+
+
+def to_flow(descriptors: Tensor, points: Tensor) -> Tensor:
+    """Descriptors whose place in the portrait is counted from the driven point."""
+    place = slice(-PLACE_SIZE, 2 - PLACE_SIZE)
+    flow = descriptors[..., place] - points[..., :2]
+    return torch.cat(
+        [descriptors[..., : place.start], flow, descriptors[..., place.stop :]], dim=-1
+    )

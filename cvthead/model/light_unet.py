@@ -1,8 +1,9 @@
-"""U-Net of the open preset: works at half resolution behind a pixel unshuffle."""
+"""U-Net of the open preset: works at half resolution, finishes at full resolution."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -10,40 +11,52 @@ from torch.nn import functional as F
 
 from cvthead.model.layers import conv_bn_relu, upsample
 
-HEAD_SIZE = 16
+PIXEL_SIZE = 8  # channels at full resolution
+PORTRAIT_SIZE = 4  # RGB and mask
+GATE_BIAS = 1.0  # the warped portrait is trusted until training says where not to
 
 
 class LightUNet(nn.Module):
-    """Splat -> RGB and mask logits, at a third of the paper U-Net's multiplications."""
+    """Filled splat and warped portrait -> RGB and mask logits."""
 
     def __init__(self, size_in: int, sizes: Sequence[int], unshuffle: int) -> None:
         super().__init__()
         self.unshuffle = unshuffle
-        self.stem = conv_bn_relu(size_in * unshuffle**2, sizes[0], kernel=1)
-        self.downs = nn.ModuleList()
-        before = sizes[0]
-        for size in sizes:
-            self.downs.append(nn.Sequential(conv_bn_relu(before, size), conv_bn_relu(size, size)))
-            before = size
+        self.stem = conv_bn_relu(size_in + PORTRAIT_SIZE * unshuffle**2, sizes[0], kernel=1)
+        self.downs = nn.ModuleList([conv_bn_relu(sizes[0], sizes[0])])
+        for before, size in pairwise(sizes):
+            self.downs.append(
+                nn.Sequential(nn.MaxPool2d(2), conv_bn_relu(before, size), conv_bn_relu(size, size))
+            )
         self.laterals = nn.ModuleList()
         self.ups = nn.ModuleList()
+        before = sizes[-1]
         for size in reversed(sizes[:-1]):
             self.laterals.append(conv_bn_relu(before, size, kernel=1))
             self.ups.append(nn.Sequential(conv_bn_relu(2 * size, size), conv_bn_relu(size, size)))
             before = size
-        self.to_shuffle = nn.Conv2d(before, HEAD_SIZE * unshuffle**2, 3, padding=1)
-        self.refine = nn.Conv2d(HEAD_SIZE, HEAD_SIZE, 3, padding=1)
-        self.to_image = nn.Conv2d(HEAD_SIZE, 4, 3, padding=1)
+        self.to_pixels = nn.Conv2d(before, PIXEL_SIZE * unshuffle**2, 3, padding=1)
+        self.to_image = nn.Conv2d(PIXEL_SIZE + PORTRAIT_SIZE, 5, 3, padding=1)
 
-    def forward(self, x: Tensor) -> Tensor:
-        """(b, size_in, h, w) -> (b, 4, h, w): RGB and mask before tanh and sigmoid."""
-        x = self.stem(F.pixel_unshuffle(x, self.unshuffle))
+    def forward(self, splat: Tensor, warped: Tensor) -> tuple[Tensor, Tensor]:
+        """Paint a frame.
+
+        Args:
+            splat: (b, size_in, h / unshuffle, w / unshuffle).
+            warped: (b, 4, h, w), the portrait's RGB in [-1, 1] and mask, carried to the pose.
+
+        Returns:
+            RGB (b, 3, h, w) in [-1, 1]: warped pixels and painted ones, mixed by a learned gate;
+            mask logits (b, 1, h, w).
+        """
+        x = self.stem(torch.cat([splat, F.pixel_unshuffle(warped, self.unshuffle)], dim=1))
         skips = []
-        for level, down in enumerate(self.downs):
-            x = down(F.max_pool2d(x, 2) if level else x)
+        for down in self.downs:
+            x = down(x)
             skips.append(x)
         for lateral, up, skip in zip(self.laterals, self.ups, reversed(skips[:-1]), strict=True):
             x = up(torch.cat([upsample(lateral(x)), skip], dim=1))
-        x = F.relu(F.pixel_shuffle(self.to_shuffle(x), self.unshuffle))
-        out: Tensor = self.to_image(F.relu(self.refine(x)))
-        return out
+        x = F.pixel_shuffle(F.relu(self.to_pixels(x)), self.unshuffle)
+        out = self.to_image(torch.cat([x, warped.to(x.dtype)], dim=1)).float()
+        gate = torch.sigmoid(out[:, 4:] + GATE_BIAS)
+        return gate * warped[:, :3] + (1 - gate) * torch.tanh(out[:, :3]), out[:, 3:4]

@@ -3,7 +3,8 @@
 The paper argues (section 3.3) that features sampled at a vertex's projection are sharp where
 the vertex is visible and wrong where it is not. So they are gated by visibility; hidden points
 see their mirrored counterpart when that is visible, and the transformer's feature always.
-The first three descriptor channels are the point's colour in [-1, 1].
+The first three descriptor channels are the point's colour in [-1, 1], the last three say where
+the portrait shows the point.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 COLOUR_SIZE = 3
+PLACE_SIZE = 3  # x, y in the portrait, seen
 
 
 def sample(image: Tensor, points: Tensor) -> Tensor:
@@ -56,7 +58,8 @@ class PixelAlignedFusion(nn.Module):
             mirror: (p,) the point's mirrored counterpart.
 
         Returns:
-            (b, p, size); colour first.
+            (b, p, size + 3): colour, learned channels, then the point's place in the portrait:
+            normalised x and y, and 1 where the portrait sees the point.
         """
         own = visible[..., None]
         other = own[:, mirror] * (1 - own)
@@ -69,4 +72,5 @@ class PixelAlignedFusion(nn.Module):
         known = own + other
         guess = torch.tanh(out[..., :COLOUR_SIZE].float())
         painted = colour + mirrored_colour + (1 - known) * guess
-        return torch.cat([painted, out[..., COLOUR_SIZE:].float()], dim=-1)
+        learned = out[..., COLOUR_SIZE:].float()
+        return torch.cat([painted, learned, points[..., :2], own], dim=-1)

@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 
 EMPTY_DEPTH = -2.0
+BLOCK = 4  # pixels; wide enough that the points of the front surface leave no block empty
+FRONT = 0.15  # thickness of the front surface in normalised depth, about 25 mm
 
 
 def pixel_index(projected: Tensor, size: int) -> Tensor:
@@ -71,11 +73,25 @@ def paint(owner: Tensor, depth: Tensor, descriptors: Tensor, size: int) -> Tenso
     return image.transpose(1, 2).reshape(len(rows), -1, size, size)
 
 
+def in_front(projected: Tensor, size: int) -> Tensor:
+    """(b, p) whether each point lies at the front surface of its block of pixels.
+
+    Points are sparse on the scalp; without this test the back of the head shines through.
+    """
+    blocks = size // BLOCK
+    index = pixel_index(projected, blocks)
+    depth = projected[..., 2]
+    nearest = torch.full_like(depth[:, :1], torch.inf).repeat(1, blocks * blocks + 1)
+    nearest.scatter_reduce_(1, index, depth, "amin")
+    return depth <= nearest.gather(1, index) + FRONT
+
+
 def splat(projected: Tensor, descriptors: Tensor, size: int) -> Tensor:
     """Splat of the open preset: (b, p, 3) and (b, p, c) -> (b, 1 + c, size, size)."""
     depth = projected[..., 2].contiguous()
-    owner = nearest_points(pixel_index(projected, size), depth, size)
-    return paint(owner, depth, descriptors, size)
+    front = in_front(projected, size)
+    index = torch.where(front, pixel_index(projected, size), size * size)
+    return paint(nearest_points(index, depth, size), depth, descriptors, size)
 
 
 def splat_clamped(projected: Tensor, descriptors: Tensor, size: int) -> Tensor:

@@ -23,12 +23,17 @@ from cvthead.head.model import HeadModel
 from cvthead.points import PointLayout
 from cvthead.source import driven_points, network_input
 from cvthead.training.records import Frame, Record
+from cvthead.visibility import inside_mask
 
 Array = NDArray[np.float32]
 
 VIEWS = 2
-CLIP_SHARE = 0.5
+CLIP_SHARE = 0.6
+CANDIDATES = 3  # frames drawn per view of a clip; the one that differs most from the source stays
 ZOOM, SHIFT = 0.07, 0.04  # jitter of the source crop, relative to its size
+CUT_SHARE = 0.25  # sources whose picture ends below the chin
+CUT_RANGE = (0.72, 0.95)  # where, as a share of the crop
+STRONG_COLOUR_SHARE = 0.4
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,8 +92,9 @@ class PairDataset(Dataset[dict[str, Tensor]]):
         own = points(source)
         if record.frames > 1:
             views = []
-            for other in rng.integers(record.frames, size=VIEWS):
-                frame = record.frame(int(other))
+            for drawn in rng.integers(record.frames, size=(VIEWS, CANDIDATES)):
+                far = max(drawn.tolist(), key=lambda other: record.motion(number, other))
+                frame = record.frame(far)
                 views.append(as_view(frame, points(frame)))
         else:
             view = as_view(source, own)
@@ -99,9 +105,10 @@ class PairDataset(Dataset[dict[str, Tensor]]):
             np.clip(colours(image.astype(np.float32) / np.float32(255)), 0, 1) * 255
         ).astype(np.uint8)
         views = [replace(v, image=np.clip(colours(v.image), 0, 1)) for v in views]
+        if rng.random() < CUT_SHARE:
+            mask = cut_below(mask, float(rng.uniform(*CUT_RANGE)))
         network = network_input(image, mask)
-        inside = (np.abs(own[:, :2]) < 1).all(axis=1)
-        visible *= inside
+        visible *= inside_mask(own, mask)
         if rng.random() < 0.5:  # the whole sample seen in a mirror
             network = network[:, :, ::-1]
             own, visible = flip_points(own, self.layout), flip_order(visible, self.layout)
@@ -112,6 +119,7 @@ class PairDataset(Dataset[dict[str, Tensor]]):
             "points": own,
             "visible": visible,
             "anchor": anchor,
+            "window": rng.random(2),
             "background": np.full((VIEWS, 3, 1, 1), 1, np.float32) * rng.random((1, 3, 1, 1)),
             "image": np.stack([self._resized(v.image).transpose(2, 0, 1) for v in views]),
             "mask": np.stack([self._resized(v.mask)[None] for v in views]),
@@ -175,21 +183,37 @@ def jittered(
     return image.astype(np.uint8), mask.astype(np.float32), moved
 
 
+def cut_below(mask: Array, share: float) -> Array:
+    """The person mask of a picture that ends ``share`` of the way down the crop."""
+    out = mask.copy()
+    out[round(share * len(mask)) :] = 0
+    return out
+
+
 @dataclass(frozen=True)
 class ColourJitter:
-    gain: Array
+    """Affine change of colour: ``image @ matrix + offset``, clipped to 0..1."""
+
+    matrix: Array
     offset: float
-    saturation: float
 
     def __call__(self, image: Array) -> Array:
-        grey = image.mean(axis=-1, keepdims=True)
-        out = (grey + (image - grey) * self.saturation) * self.gain + self.offset
-        return np.asarray(np.clip(out, 0, 1), np.float32)
+        return np.asarray(np.clip(image @ self.matrix + np.float32(self.offset), 0, 1), np.float32)
 
 
 def colour_jitter(rng: np.random.Generator) -> ColourJitter:
-    """One change of light and white balance for all images of a sample."""
+    """One change of light, saturation and hue for all images of a sample.
+
+    A part of the samples gets any hue at all: colours must be copied, not guessed from what
+    people and clothes usually look like.
+    """
+    strong = rng.random() < STRONG_COLOUR_SHARE
+    hue = rng.uniform(-np.pi, np.pi) if strong else rng.normal(0, 0.05)
     gain = rng.uniform(0.8, 1.15) * rng.uniform(0.94, 1.06, 3)
-    return ColourJitter(
-        gain.astype(np.float32), float(rng.uniform(-0.04, 0.06)), float(rng.uniform(0.75, 1.2))
-    )
+    # Rodrigues' rotation of RGB about the grey axis.
+    axis = np.full(3, 3**-0.5)
+    turn = cv2.Rodrigues(axis * hue)[0]
+    grey = np.full((3, 3), 1 / 3)
+    saturation = rng.uniform(0.75, 1.2)
+    matrix = (grey + (np.eye(3) - grey) * saturation) @ turn * gain
+    return ColourJitter(matrix.astype(np.float32), float(rng.uniform(-0.04, 0.06)))

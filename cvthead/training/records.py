@@ -75,6 +75,14 @@ class Record:
             Camera(*a["camera"][number].tolist()),
         )
 
+    def motion(self, one: int, other: int) -> float:
+        """How much two frames differ: mean change of pose in radians plus a tenth of the
+        root mean square change of expression."""
+        pose, expression = (
+            self.arrays[name][one] - self.arrays[name][other] for name in ("pose", "expression")
+        )
+        return float(np.abs(pose).mean() + 0.1 * np.sqrt(np.square(expression).mean()))
+
     def deformation(self, number: int) -> Deformation:
         a = self.arrays
         return Deformation(

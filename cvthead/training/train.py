@@ -87,7 +87,9 @@ def render_views(model: CVTHead, batch: dict[str, Tensor], size: int) -> tuple[T
         batch["source"], batch["points"], batch["visible"], batch["anchor"]
     )
     descriptors = repeat(descriptors, "b p c -> (b v) p c", v=VIEWS)
-    return model.paint(rearrange(batch["driven"], "b v p c -> (b v) p c"), descriptors, size)
+    portrait = repeat(batch["source"], "b c h w -> (b v) c h w", v=VIEWS)
+    driven = rearrange(batch["driven"], "b v p c -> (b v) p c")
+    return model.paint(driven, descriptors, portrait, size)
 
 
 def train(
@@ -163,7 +165,7 @@ def train(
             views = {
                 name: rearrange(batch[name], "b v ... -> (b v) ...")
                 for name in ("image", "mask", "valid", "background")
-            }
+            } | {"window": batch["window"]}
             losses = reconstruction_losses(rgb, logits, views, perceptual)
         total = torch.stack([getattr(weights, k) * v for k, v in losses.items()]).sum()
         optimizer.zero_grad(set_to_none=True)
