@@ -43,6 +43,7 @@ ARRAYS: dict[str, tuple[str, tuple[int | str, ...]]] = {
     "pose": ("F32", (POSE_SIZE,)),
     "camera": ("F64", (len(CAMERA_FIELDS),)),
     "crop": ("F64", (len(CROP_FIELDS),)),
+    "drawn": ("BOOL", ("P",)),
     "portrait": ("U8", ("D",)),
     "background": ("U8", ("B",)),
 }
@@ -56,6 +57,8 @@ class Avatar:
         descriptors: (P, C + 3) float16, in the order of the preset's PointLayout without the
             unused shell points: V_F of the paper's section 3.3, then the point's x and y in the
             portrait and 1 where the portrait sees it.
+        drawn: (P,) bool, points that belong to the avatar; of the others, which the portrait cuts
+            off, nothing is known.
         portrait: (256, 256, 4) uint8, the cropped person: RGB multiplied by the mask (grey 128
             where there is no person), then the mask.
         deformation: hair and shoulders, in rest space.
@@ -68,6 +71,7 @@ class Avatar:
     """
 
     descriptors: NDArray[np.float16]
+    drawn: NDArray[np.bool_]
     portrait: NDArray[np.uint8]
     deformation: Deformation
     coefficients: Coefficients
@@ -78,22 +82,21 @@ class Avatar:
     fingerprint: str
 
     def __post_init__(self) -> None:
-        for name in ("descriptors", "portrait"):
+        for name in ("descriptors", "drawn", "portrait"):
             constant = getattr(self, name).view()
             constant.flags.writeable = False  # shared between threads
             object.__setattr__(self, name, constant)
 
     @cached_property
-    def portrait_input(self) -> NDArray[np.float32]:
-        """(4, 256, 256) float32: the portrait as the network takes it, RGB in [-1, 1], mask."""
-        scale = np.array([2, 2, 2, 1], np.float32) / 255
-        image = self.portrait * scale - np.array([1, 1, 1, 0], np.float32)
-        return np.ascontiguousarray(image.transpose(2, 0, 1))
+    def rows(self) -> NDArray[np.float32]:
+        """The descriptors in single precision, converted once."""
+        return self.descriptors.astype(np.float32)
 
     def to_bytes(self) -> bytes:
         """One safetensors file of less than 1 MB."""
         tensors = {
             "descriptors": self.descriptors,
+            "drawn": self.drawn,
             "offsets": self.deformation.offsets.astype(np.float16),
             "shell_anchor": self.deformation.shell_anchor,
             "shell_offset": self.deformation.shell_offset.astype(np.float16),
@@ -199,6 +202,7 @@ def _avatar(arrays: dict[str, NDArray[Any]], metadata: dict[str, str]) -> Avatar
     _picture("background", background, JpegImageFile, "RGB")
     return Avatar(
         arrays["descriptors"],
+        arrays["drawn"],
         _picture("portrait", arrays["portrait"].tobytes(), PngImageFile, "RGBA"),
         Deformation(
             arrays["offsets"].astype(np.float32), anchor, arrays["shell_offset"].astype(np.float32)

@@ -2,7 +2,9 @@
 
     CVTHeadError
     |-- InputError                  the caller's data is at fault
-    |   |-- ImageError              not an image, truncated, too large, too small
+    |   |-- ImageError              truncated, damaged, too small
+    |   |   |-- ImageTypeError      not a PNG, JPEG or WebP picture
+    |   |   `-- ImageTooLargeError  more pixels or bytes than are decoded
     |   |-- CoefficientsError       wrong length, NaN, out of range, unknown ARKit name
     |   |-- FaceError
     |   |   |-- NoFaceError
@@ -14,7 +16,8 @@
     |   |-- AvatarFileError         not an avatar file, truncated, other format version
     |   |-- ModelChangedError       made with other trained weights
     |   |-- AvatarNotFoundError
-    |   `-- AvatarExpiredError
+    |   |-- AvatarExpiredError
+    |   `-- StoreError              the store cannot be written
     `-- AssetError                  a file of the installed package is missing or altered
 
 The message says what is wrong; ``hint`` says what to do next; ``code`` is stable.
@@ -42,6 +45,14 @@ class InputError(CVTHeadError):
 
 class ImageError(InputError):
     code = "invalid_image"
+
+
+class ImageTypeError(ImageError):
+    code = "unsupported_media_type"
+
+
+class ImageTooLargeError(ImageError):
+    code = "image_too_large"
 
 
 class VideoError(InputError):
@@ -101,6 +112,10 @@ class AvatarNotFoundError(AvatarError):
 
 class AvatarExpiredError(AvatarError):
     code = "avatar_expired"
+
+
+class StoreError(AvatarError):
+    code = "store_full"
 
 
 class AssetError(CVTHeadError):

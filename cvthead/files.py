@@ -65,11 +65,23 @@ def write_errors(target: Path | str) -> Iterator[None]:
         ) from error
 
 
-def write_file(path: Path | str, data: bytes) -> None:
+def write_file(path: Path | str, data: bytes, *, mode: int = 0o666) -> None:
     """Write ``data`` to ``path`` atomically.
+
+    Args:
+        mode: permissions of the new file, less the process's umask.
 
     Raises:
         InputError: see ``atomic_path``.
     """
-    with atomic_path(path) as temporary, write_errors(path):
-        temporary.write_bytes(data)
+
+    def opened(name: str, flags: int) -> int:
+        # From the start: a file that is narrowed afterwards could be opened before.
+        return os.open(name, flags, mode)
+
+    with (
+        atomic_path(path) as temporary,
+        write_errors(path),
+        open(temporary, "xb", opener=opened) as file,
+    ):
+        file.write(data)

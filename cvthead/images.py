@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from PIL import Image, ImageCms
 from PIL.ImageFile import ImageFile
 from PIL.JpegImagePlugin import JpegImageFile
-from PIL.PngImagePlugin import PngImageFile, PngInfo
+from PIL.PngImagePlugin import PngImageFile
 from PIL.WebPImagePlugin import WebPImageFile
 
-from cvthead.errors import ImageError
-from cvthead.provenance import PNG_KEYWORD, SourceType, xmp_packet
+from cvthead.errors import ImageError, ImageTooLargeError, ImageTypeError
+from cvthead.provenance import SourceType, mark_png, xmp_packet
 
 MAX_PIXELS = 50_000_000
 MAX_SIDE = 12_000
@@ -74,15 +74,17 @@ def decode_image(data: bytes) -> NDArray[np.uint8]:
         (H, W, 3) uint8 RGB; both sides ``MIN_SIDE`` to ``MAX_SIDE``, at most ``MAX_PIXELS``.
 
     Raises:
-        ImageError: another type (the message names it), too large, too small, or damaged.
+        ImageTypeError: another type; the message names it.
+        ImageTooLargeError: too many bytes or pixels.
+        ImageError: too small, truncated or damaged.
     """
     if len(data) > MAX_BYTES:
-        raise ImageError(
+        raise ImageTooLargeError(
             f"the file is larger than {MAX_BYTES >> 20} MiB", hint="Send a smaller picture."
         )
     kind = _sniff(data)
     if kind not in get_args(ImageFormat):
-        raise ImageError(
+        raise ImageTypeError(
             f"not a PNG, JPEG or WebP picture but {kind}",
             hint="Convert it to JPEG, PNG or WebP first.",
         )
@@ -129,22 +131,26 @@ def encode_image(
             f"cannot encode an array of shape {image.shape} and type {image.dtype}",
             hint="Pass (H, W, 3) or (H, W, 4) uint8.",
         )
-    picture = Image.fromarray(on_white(image) if image_format == "jpeg" else image)
-    packet = xmp_packet(source)
-    out = BytesIO()
     try:
         if image_format == "png":
-            info = PngInfo()
-            info.add_itxt(PNG_KEYWORD, packet.decode())
-            picture.save(out, "PNG", pnginfo=info)
-        else:
-            picture.save(out, image_format.upper(), quality=quality, xmp=packet)
-    except (OSError, ValueError, KeyError) as error:
+            return mark_png(_png(image), source)
+        out = BytesIO()
+        picture = Image.fromarray(on_white(image) if image_format == "jpeg" else image)
+        picture.save(out, image_format.upper(), quality=quality, xmp=xmp_packet(source))
+        return out.getvalue()
+    except (OSError, ValueError, KeyError, cv2.error) as error:
         raise ImageError(
             f"cannot encode {image.shape[1]} x {image.shape[0]} px as {image_format}: {error}",
             hint="WebP holds up to 16,383 px a side, JPEG up to 65,535 px; none holds 0 px.",
         ) from error
-    return out.getvalue()
+
+
+def _png(image: NDArray[np.uint8]) -> bytes:
+    # A sixth of Pillow's time: the average filter lets the fastest compression come within a few
+    # percent of the best one on rendered heads.
+    order = cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
+    filtered = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_AVG]
+    return cv2.imencode(".png", cv2.cvtColor(image, order), filtered)[1].tobytes()
 
 
 def on_white(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -222,7 +228,7 @@ def _little(data: bytes) -> int:
 
 def _check_size(width: int, height: int) -> None:
     if max(width, height) > MAX_SIDE or width * height > MAX_PIXELS:
-        raise ImageError(
+        raise ImageTooLargeError(
             f"the picture is too large: {width:,} x {height:,} px",
             hint=f"Shrink it to {MAX_PIXELS // 1_000_000} megapixels or less "
             f"and at most {MAX_SIDE:,} px a side.",

@@ -6,38 +6,35 @@ runs the head model, the splat and the U-Net, and nothing else.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from cvthead.avatar import Avatar
-from cvthead.camera import CROP_PIXELS, Camera
+from cvthead.camera import Camera
 from cvthead.coefficients import Coefficients
 from cvthead.controls import Controls, resolve
-from cvthead.deformation import MAX_SHELL_POINTS, DeformationModel
+from cvthead.deformation import DeformationModel
 from cvthead.errors import AssetError, AvatarFileError, ModelChangedError
 from cvthead.frame import Frame
 from cvthead.head.arkit import ArkitMap
-from cvthead.head.hierarchy import MeshHierarchy
 from cvthead.head.model import HeadModel
-from cvthead.model.config import OPEN
-from cvthead.model.cvthead import CVTHead
-from cvthead.model.pixel_aligned import PLACE_SIZE
-from cvthead.points import PointLayout
+from cvthead.points import FAR_AWAY, PointLayout
+from cvthead.runtime.model_folder import packaged
+from cvthead.runtime.networks import Networks
 from cvthead.source import (
     HeadCrop,
     Source,
     cut_head,
     driven_points,
-    network_input,
+    portrait_pixels,
     read_source,
 )
 from cvthead.tracking.tracker import Tracker
-from cvthead.weights import load_into, packaged_weights
 
 BACKGROUND_QUALITY = 90
 # The person's edge is soft; inpainting from just outside it would smear hair into the background.
@@ -53,39 +50,44 @@ class Pipeline:
     tracker: Tracker
     deformer: DeformationModel
     layout: PointLayout
-    model: CVTHead
-    preset: str
-    fingerprint: str
+    networks: Networks
 
     @classmethod
-    def load(cls, preset: str = "open", weights: Path | None = None) -> Pipeline:
-        """Load head, tracker and trained weights.
+    def load(
+        cls, preset: str = "open", *, model: Path | None = None, threads: int | None = None
+    ) -> Pipeline:
+        """Load head, tracker and trained networks.
 
         Args:
             preset: "open".
-            weights: other weights of the same preset than the packaged ones.
+            model: folder of another model of the preset than the packaged one, as
+                cvthead.training.export writes it.
+            threads: of the trained networks; None takes the machine's cores, at most 4.
 
         Raises:
             AssetError: an unknown preset, or a missing or altered file.
         """
         if preset != "open":
             raise AssetError(f"unknown preset {preset!r}", hint="use the preset 'open'")
+        networks = Networks.load(model or packaged(preset), threads=threads)
         head = HeadModel.load()
-        layout = PointLayout.of(head)
-        model = CVTHead(OPEN, MeshHierarchy.load(), layout)
-        mark = load_into(model, weights or packaged_weights(preset))
-        model = model.eval().requires_grad_(False)
-        model = model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         return cls(
             head,
             ArkitMap.load(),
             Tracker.load(head),
             DeformationModel.from_head(head),
-            layout,
-            model,
-            preset,
-            mark,
+            PointLayout.of(head),
+            networks,
         )
+
+    @property
+    def preset(self) -> str:
+        return self.networks.preset
+
+    @property
+    def fingerprint(self) -> str:
+        """Of the trained weights; an avatar made with others is refused."""
+        return self.networks.fingerprint
 
     def encode(
         self,
@@ -112,7 +114,8 @@ class Pipeline:
         source = read_source(self.deformer, self.layout, crop, deform=deform)
         return Avatar(
             self.describe(source),
-            portrait(crop),
+            source.drawn[: self._used(source)],
+            portrait_pixels(source.network_input),
             source.deformation,
             crop.coefficients,
             crop.camera,
@@ -122,19 +125,12 @@ class Pipeline:
             self.fingerprint,
         )
 
-    @torch.inference_mode()
     def describe(self, source: Source) -> NDArray[np.float16]:
         """(P, C + 3) descriptors of a source, unused shell points left out."""
-        shell = len(source.deformation.shell_anchor)
-        anchor = np.zeros(MAX_SHELL_POINTS, np.int64)
-        anchor[:shell] = source.deformation.shell_anchor
-        out = self.model.describe(
-            torch.from_numpy(source.network_input)[None],
-            torch.from_numpy(source.points)[None],
-            torch.from_numpy(source.visible.astype(np.float32))[None],
-            torch.from_numpy(anchor)[None],
-        )
-        return out[0, : self.layout.surface + shell].numpy().astype(np.float16)
+        return self.networks.describe(source)[: self._used(source)].astype(np.float16)
+
+    def _used(self, source: Source) -> int:
+        return self.layout.surface + len(source.deformation.shell_anchor)
 
     def render(self, avatar: Avatar, controls: Controls | None = None) -> Frame:
         """Render the avatar as the controls ask; absent ones keep the portrait's values.
@@ -162,24 +158,26 @@ class Pipeline:
     def pose(
         self, avatar: Avatar, coefficients: Coefficients, camera: Camera
     ) -> NDArray[np.float32]:
-        """Driven point projections (P, 3): head model, skinning, camera."""
+        """Driven point projections (P, 3): head model, skinning, camera. Points that the
+        portrait cuts off are far away."""
         self._check(avatar)
         points = driven_points(self.head, self.layout, coefficients, avatar.deformation, camera)
-        return points[: len(avatar.descriptors)]
+        points = points[: len(avatar.descriptors)]
+        points[~avatar.drawn] = FAR_AWAY
+        return points
 
-    @torch.inference_mode()
     def paint(self, avatar: Avatar, points: NDArray[np.float32]) -> Frame:
-        """Splat and U-Net (paper section 3.4)."""
-        self._check(avatar)
-        rgb, logits = self.model.paint(
-            torch.from_numpy(points)[None],
-            torch.from_numpy(avatar.descriptors.astype(np.float32))[None],
-            torch.from_numpy(avatar.portrait_input)[None],
-            CROP_PIXELS,
-        )
-        colour = ((rgb[0] + 1) * 127.5).round().byte().permute(1, 2, 0).contiguous()
-        alpha = (logits[0, 0].sigmoid() * 255).round().byte()
-        return Frame(colour.numpy(), alpha.numpy())
+        """Splat, warp and U-Net (paper section 3.4)."""
+        return self.paint_many([(avatar, points)])[0]
+
+    def paint_many(self, frames: Sequence[tuple[Avatar, NDArray[np.float32]]]) -> list[Frame]:
+        """:meth:`paint` of several frames, of the same or of different avatars, at once."""
+        inputs = []
+        for avatar, points in frames:
+            self._check(avatar)
+            inputs.append(self.networks.place(points, avatar.rows, avatar.portrait))
+        painted = self.networks.paint(inputs)
+        return [Frame(np.ascontiguousarray(rgba[..., :3]), rgba[..., 3]) for rgba in painted]
 
     def _check(self, avatar: Avatar) -> None:
         """Refuse an avatar of other weights, or one whose arrays do not fit (a forged file)."""
@@ -192,7 +190,7 @@ class Pipeline:
             )
         points = self.layout.surface + len(avatar.deformation.shell_anchor)
         expected = {
-            "descriptors": (points, self.model.config.descriptor_size + PLACE_SIZE),
+            "descriptors": (points, self.networks.row_size),
             "offsets": (self.layout.vertices, 3),
         }
         found = {
@@ -210,13 +208,6 @@ class Pipeline:
         image = cv2.imdecode(np.frombuffer(avatar.background, np.uint8), cv2.IMREAD_COLOR_RGB)
         assert image is not None, "avatar files are checked when they are loaded"
         return image.astype(np.uint8)
-
-
-def portrait(crop: HeadCrop) -> NDArray[np.uint8]:
-    """(256, 256, 4) uint8 of the person alone, as :class:`Avatar` keeps it."""
-    rgb, mask = network_input(crop.image, crop.mask)[:3], crop.mask[..., None] * 255
-    image = np.concatenate([(rgb.transpose(1, 2, 0) + 1) * 127.5, mask], axis=-1)
-    return np.asarray(np.rint(image), np.uint8)
 
 
 def without_person(crop: HeadCrop) -> bytes:

@@ -15,7 +15,7 @@ from cvthead.head.model import HeadModel, Region
 from cvthead.points import PointLayout
 from cvthead.silhouette import person_mask
 from cvthead.tracking.tracker import TrackedFace, Tracker
-from cvthead.visibility import eroded, visible_points
+from cvthead.visibility import eroded, on_person, visible_points
 
 Array = NDArray[np.float32]
 
@@ -50,12 +50,15 @@ class Source:
         deformation: hair and shoulders in rest space.
         points: (P, 3) normalised projections, numbered by the PointLayout.
         visible: (P,) bool, which of them the portrait sees.
+        drawn: (P,) bool, which of them are part of the avatar; the others lie beyond the
+            picture's edge, or beside the person.
     """
 
     head: HeadCrop
     deformation: Deformation
     points: Array
     visible: NDArray[np.bool_]
+    drawn: NDArray[np.bool_]
 
     @property
     def network_input(self) -> Array:
@@ -67,6 +70,14 @@ def network_input(image: NDArray[np.uint8], mask: Array) -> Array:
     """RGB (S, S, 3) uint8 and mask (S, S) -> (4, S, S) float32 for the encoder."""
     rgb = image.astype(np.float32).transpose(2, 0, 1) * np.float32(2 / 255) - 1
     return np.concatenate([rgb * mask, mask[None]])
+
+
+def portrait_pixels(source: Array) -> NDArray[np.uint8]:
+    """(4, S, S) of :func:`network_input` -> (S, S, 4) uint8, as an Avatar keeps it."""
+    shown = (source.transpose(1, 2, 0) + np.array([1, 1, 1, 0], np.float32)) * np.array(
+        [127.5, 127.5, 127.5, 255], np.float32
+    )
+    return np.rint(shown).astype(np.uint8)
 
 
 def cut_head(tracker: Tracker, image: NDArray[np.uint8], face: TrackedFace) -> HeadCrop:
@@ -112,4 +123,4 @@ def read_source(
     projected = driven_points(model, layout, head.coefficients, deformation, head.camera)
     mask = eroded(head.mask, 1)
     visible = visible_points(layout, model.faces, projected, mask, head.camera.scale)
-    return Source(head, deformation, projected, visible)
+    return Source(head, deformation, projected, visible, on_person(projected, head.mask))

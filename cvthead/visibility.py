@@ -19,6 +19,7 @@ Z_BUFFER_PIXELS = 72
 DEPTH_TOLERANCE = 0.012
 GRAZING = 0.1
 MASK_LEVEL = 0.5
+MARGIN = 3.0  # pixels
 
 
 def visible_points(
@@ -50,6 +51,21 @@ def inside_mask(points: NDArray[np.float32], mask: NDArray[np.float32]) -> NDArr
     inside = ((pixel >= 0) & (pixel < size)).all(axis=1)
     x, y = np.clip(pixel, 0, size - 1).T
     return np.asarray(inside & (mask[y, x] > MASK_LEVEL))
+
+
+def on_person(points: NDArray[np.float32], mask: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """(P,) whether each projection lies on the person or at most MARGIN pixels beside.
+
+    The others belong to parts of the body that the picture cuts off: nothing is known of them,
+    so they are not drawn.
+    """
+    size = mask.shape[0]
+    outside = (mask <= MASK_LEVEL).astype(np.uint8)
+    distance = cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_3)
+    pixel = np.floor((points[:, :2] * 0.5 + 0.5) * size).astype(np.int64)
+    inside = ((pixel >= 0) & (pixel < size)).all(axis=1)
+    x, y = np.clip(pixel, 0, size - 1).T
+    return np.asarray(inside & (distance[y, x] <= MARGIN))
 
 
 def _in_front(points: NDArray[np.float32], scale: float) -> NDArray[np.bool_]:

@@ -29,6 +29,7 @@ def made_avatar(seed: int = 0, points: int = 50) -> Avatar:
     rng = np.random.default_rng(seed)
     return Avatar(
         rng.normal(size=(points, 19)).astype(np.float16),
+        rng.random(points) > 0.2,
         rng.integers(0, 256, (256, 256, 4)).astype(np.uint8),
         Deformation(
             rng.normal(size=(30, 3)).astype(np.float16).astype(np.float32),
@@ -56,4 +57,4 @@ def plain(a: Avatar) -> tuple[object, ...]:
 def arrays(a: Avatar) -> tuple[np.ndarray, ...]:
     d, c = a.deformation, a.coefficients
     shell = d.shell_anchor, d.shell_offset
-    return a.descriptors, a.portrait, d.offsets, *shell, c.shape, c.expression, c.pose
+    return a.descriptors, a.drawn, a.portrait, d.offsets, *shell, c.shape, c.expression, c.pose

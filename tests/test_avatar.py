@@ -72,7 +72,7 @@ def test_arrays_cannot_be_changed() -> None:
         # shapes, among them some that NumPy would broadcast
         ({"descriptors": half(50)}, "descriptors has shape"),
         ({"descriptors": half(50, 0)}, "descriptors"),
-        ({"descriptors": half(36, 24)}, "fewer descriptors"),
+        ({"descriptors": half(36, 24), "drawn": np.ones(36, bool)}, "fewer descriptors"),
         ({"offsets": half(3)}, "offsets has shape"),
         ({"offsets": half(30, 1)}, "offsets has shape"),
         ({"offsets": half(1, 30, 3)}, "offsets has shape"),
@@ -83,6 +83,7 @@ def test_arrays_cannot_be_changed() -> None:
         (
             {
                 "descriptors": half(600, 24),
+                "drawn": np.ones(600, bool),
                 "shell_anchor": np.zeros(513, np.int32),
                 "shell_offset": half(513, 3),
             },

@@ -365,9 +365,10 @@ def test_bench_names_every_stage(capsys: pytest.CaptureFixture[str]) -> None:
         "deformation",
         "describe",
         "pose",
-        "splat",
+        "splat and warp",
         "U-Net",
         "composite",
+        "JPEG to JPEG",
     ):
         assert f"\n{stage}" in printed
 

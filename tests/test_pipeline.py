@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from onnxruntime import InferenceSession
 
 from cvthead import Avatar, Controls, Pipeline
 from cvthead.avatar import Avatar as AvatarType
@@ -36,29 +37,44 @@ def avatar(pipeline: Pipeline, portrait: NDArray[np.uint8]) -> AvatarType:
     return pipeline.encode(portrait)
 
 
-class Calls:
-    """Counts forward passes of a module; forwards nothing itself."""
+class Counted:
+    """A session that also counts its runs."""
 
-    def __init__(self, module: nn.Module) -> None:
-        self.count = 0
-        module.register_forward_hook(self._seen)
+    def __init__(self, session: InferenceSession) -> None:
+        self.session, self.count = session, 0
 
-    def _seen(self, module: nn.Module, inputs: tuple[Tensor, ...], output: object) -> None:
+    def run(self, *arguments: Any) -> Any:
         self.count += 1
+        return self.session.run(*arguments)
 
 
 def test_second_render_of_an_id_runs_no_encoder(
     pipeline: Pipeline, portrait: NDArray[np.uint8], tmp_path: Path
 ) -> None:
-    encoder, transformer, unet = (
-        Calls(m) for m in (pipeline.model.encoder, pipeline.model.transformer, pipeline.model.unet)
+    networks = pipeline.networks
+    describe, paint = Counted(networks.describe_session), Counted(networks.paint_session)
+    counted = replace(
+        pipeline, networks=replace(networks, describe_session=describe, paint_session=paint)
     )
     cache = AvatarCache(tmp_path)
-    key = cache.put(pipeline.encode(portrait))
-    assert (encoder.count, transformer.count) == (1, 1)
+    key = cache.put(counted.encode(portrait)).id
+    assert (describe.count, paint.count) == (1, 0)
     for jaw in (0.0, 0.2):
-        pipeline.render(cache.get(key), Controls(jaw=(jaw, 0, 0)))
-    assert (encoder.count, transformer.count, unet.count) == (1, 1, 2)
+        counted.render(cache.get(key), Controls(jaw=(jaw, 0, 0)))
+    assert (describe.count, paint.count) == (1, 2)
+
+
+def test_a_batch_equals_single_frames(pipeline: Pipeline, avatar: AvatarType) -> None:
+    poses = [
+        pipeline.pose(avatar, avatar.coefficients.with_joints({"global": (0, turn, 0)}), camera)
+        for turn, camera in ((0.0, avatar.camera), (0.3, avatar.camera))
+    ]
+    single = [pipeline.paint(avatar, points) for points in poses]
+    batch = pipeline.paint_many([(avatar, points) for points in poses])
+    for one, other in zip(single, batch, strict=True):
+        assert np.array_equal(one.rgb, other.rgb)
+        assert np.array_equal(one.alpha, other.alpha)
+    assert not np.array_equal(batch[0].rgb, batch[1].rgb)
 
 
 def test_file_round_trip_renders_the_same_and_is_small(
@@ -167,6 +183,19 @@ def test_wrong_input_is_named(pipeline: Pipeline, avatar: AvatarType, tmp_path: 
     missing.write_bytes(PORTRAIT.read_bytes())
     with pytest.raises(AvatarFileError):
         Avatar.load(missing)
+
+
+def test_what_the_portrait_cuts_off_is_not_drawn(
+    pipeline: Pipeline, portrait: NDArray[np.uint8]
+) -> None:
+    crop = pipeline.encode(portrait).crop
+    chin = round(crop.top + 0.75 * crop.size)
+    cut = pipeline.encode(portrait[:chin])
+    whole = pipeline.encode(portrait)
+    assert cut.drawn.mean() < whole.drawn.mean() - 0.03
+    below = slice(round(256 * (chin + 12 - cut.crop.top) / cut.crop.size), None)
+    assert pipeline.render(cut).alpha[below].mean() < 12
+    assert pipeline.render(whole).alpha[below].mean() > 128
 
 
 def test_alpha_and_background(pipeline: Pipeline, avatar: AvatarType) -> None:

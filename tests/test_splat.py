@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from cvthead.model.splat import (
-    EMPTY_DEPTH,
     clamped_pixel_index,
     nearest_points,
     pixel_index,
     splat,
     splat_clamped,
 )
+from cvthead.runtime.splat import BLOCK, EMPTY_DEPTH, FRONT
 
 SIZE = 16
 Splat = Callable[[Tensor, Tensor, int], Tensor]
@@ -23,12 +23,13 @@ both = pytest.mark.parametrize("draw", [splat, splat_clamped])
 
 
 def cloud(batch: int, points: int, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """Crowded points, some outside the frame, every depth different."""
+    """Crowded points of one surface, some outside the frame, every depth different."""
     random = torch.Generator().manual_seed(seed)
     projected = torch.rand(batch, points, 3, generator=random) * 2.6 - 1.3
     projected[..., 2] = torch.stack(
         [torch.randperm(points, generator=random) / points for _ in range(batch)]
     )
+    projected[..., 2] *= FRONT
     return projected, torch.randn(batch, points, 5, generator=random)
 
 
@@ -108,6 +109,17 @@ def test_gradient_reaches_exactly_the_painted_descriptors(draw: Splat) -> None:
         expected = torch.zeros(400)
         expected[owners[owners >= 0]] = 1
         assert torch.equal(gradient, expected[:, None].expand(-1, 5))
+
+
+def test_the_back_does_not_shine_through_the_front() -> None:
+    x = (BLOCK + 0.5) * 2 / SIZE - 1
+    neighbour = x + 2 / SIZE  # another pixel of the same block
+    hidden = splat(*at((x, x, 0.0), (neighbour, x, FRONT * 1.01)), SIZE)[0, 1]
+    assert hidden[hidden != 0].tolist() == [1]
+    same_surface = splat(*at((x, x, 0.0), (neighbour, x, FRONT * 0.99)), SIZE)[0, 1]
+    assert sorted(same_surface[same_surface != 0].tolist()) == [1, 2]
+    other_block = splat(*at((x, x, 0.0), (x + BLOCK * 2 / SIZE, x, 1.0)), SIZE)[0, 1]
+    assert sorted(other_block[other_block != 0].tolist()) == [1, 2]
 
 
 def test_points_outside_are_dropped_by_the_open_preset() -> None:

@@ -11,13 +11,13 @@ from cvthead.avatar import Avatar
 from cvthead.cli.driver import Drive, Options, open_driver
 from cvthead.cli.picture import (
     IMAGE_FORMATS,
-    Composer,
     add_picture_options,
     check_output,
     check_size,
     write_picture,
 )
 from cvthead.cli.portrait import add_portrait_options, read_avatar
+from cvthead.composite import Composer
 from cvthead.pipeline import Pipeline
 from cvthead.video_writer import video_writer
 

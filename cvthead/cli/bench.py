@@ -3,108 +3,84 @@
 from __future__ import annotations
 
 import argparse
-import statistics
-import time
-from collections.abc import Callable
-from typing import ParamSpec, TypeVar
+import json
+import os
+from typing import Any
 
-import numpy as np
-import torch
-from numpy.typing import NDArray
-
-from cvthead.avatar import Avatar
-from cvthead.camera import CROP_PIXELS
+from cvthead.benchmark import time_drive, time_encode, time_render, time_torch
 from cvthead.cli.portrait import add_portrait_options
-from cvthead.controls import Controls, resolve
 from cvthead.errors import InputError
 from cvthead.images import read_image
-from cvthead.model.cvthead import to_flow
-from cvthead.model.splat import splat
-from cvthead.pipeline import Pipeline, without_person
-from cvthead.source import cut_head, read_source
+from cvthead.pipeline import Pipeline
 
-P = ParamSpec("P")
-T = TypeVar("T")
-WARM_UP = 3
-ENCODES = 5
-
-
-class Stopwatch:
-    """Collects milliseconds per stage, in the order of first use."""
-
-    def __init__(self) -> None:
-        self.samples: dict[str, list[float]] = {}
-
-    def time(self, stage: str, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        start = time.perf_counter()
-        result = work(*args, **kwargs)
-        self.samples.setdefault(stage, []).append((time.perf_counter() - start) * 1000)
-        return result
-
-    def table(self, title: str, skipped: int) -> str:
-        """Medians without the first ``skipped`` samples."""
-        lines = [
-            f"{stage:<22}{statistics.median(times[skipped:]):9.2f} ms"
-            for stage, times in self.samples.items()
-        ]
-        return "\n".join([title, *lines])
+TITLES = {
+    "encode": "Once per portrait",
+    "render": "Once per frame, from coefficients",
+    "drive": "Once per frame, from a driving picture",
+    "torch": "Per-frame networks in eager float32 PyTorch",
+}
 
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = commands.add_parser(
         "bench",
         help="print how long every stage takes",
-        description="Print the median milliseconds of every stage of encoding a portrait and of "
-        "rendering it. Encoding runs once per portrait, rendering once per frame.",
+        description="Print median and 95th percentile of the milliseconds of every stage of "
+        "encoding a portrait and of rendering it, and the ratio to PyTorch in the same run when "
+        "it is installed. Run it on a quiet machine.",
     )
     add_portrait_options(parser, "portrait", "picture of a face")
     parser.add_argument(
         "--renders", type=int, default=100, metavar="N", help="frames to render (100)"
     )
+    parser.add_argument("--threads", type=int, metavar="N", help="of the networks (all cores)")
+    parser.add_argument("--json", action="store_true", help="print JSON; see docs/benchmark.md")
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> None:
-    if args.renders < 1:
-        raise InputError(f"--renders is {args.renders}", hint="use 1 or more")
+    for name in ("renders", "threads"):
+        value = getattr(args, name)
+        if value is not None and value < 1:
+            raise InputError(f"--{name} is {value}", hint="use 1 or more")
     image = read_image(args.portrait)
-    pipeline = Pipeline.load(args.preset)
-    print(_encode_table(pipeline, image, args.face))
-    print(_render_table(pipeline, pipeline.encode(image, face=args.face), args.renders))
+    threads = args.threads or len(os.sched_getaffinity(0))
+    pipeline = Pipeline.load(args.preset, threads=threads)
+    avatar = pipeline.encode(image, face=args.face)
+    report: dict[str, Any] = {
+        "threads": threads,
+        "encode": time_encode(pipeline, image, args.face),
+        "render": time_render(pipeline, avatar, args.renders),
+        "drive": time_drive(pipeline, avatar, image, args.renders),
+    }
+    try:
+        report["torch"] = time_torch(threads)
+    except ImportError:
+        report["torch"] = None
+    report["ratios"] = ratios(report)
+    print(json.dumps(report, indent=1) if args.json else table(report))
 
 
-def _encode_table(pipeline: Pipeline, image: NDArray[np.uint8], number: int | None) -> str:
-    watch = Stopwatch()
-    for _ in range(1 + ENCODES):
-        face = watch.time("track", pipeline.tracker.track, image, face=number)
-        crop = watch.time("mask", cut_head, pipeline.tracker, image, face)
-        source = watch.time("deformation", read_source, pipeline.deformer, pipeline.layout, crop)
-        watch.time("describe", pipeline.describe, source)
-        watch.time("background", without_person, crop)
-        watch.time("all of encode", pipeline.encode, image, face=number)
-    return watch.table(f"Once per portrait (median of {ENCODES})", skipped=1)
+def ratios(report: dict[str, Any]) -> dict[str, float]:
+    """How many times faster a frame is than each PyTorch path of the same run."""
+    frame = report["render"]["all of render"]["median_ms"]
+    baselines = report["torch"] or {}
+    return {name: round(times["median_ms"] / frame, 2) for name, times in baselines.items()}
 
 
-@torch.inference_mode()
-def _render_table(pipeline: Pipeline, avatar: Avatar, count: int) -> str:
-    watch = Stopwatch()
-    model = pipeline.model
-    descriptors = torch.from_numpy(avatar.descriptors.astype(np.float32))[None]
-    portrait = torch.from_numpy(avatar.portrait_input)[None]
-    for index in range(WARM_UP + count):
-        turn = index / (WARM_UP + count) - 0.5
-        controls = Controls(global_rotation=(0, turn, 0), arkit={"jawOpen": abs(turn)})
-        points = watch.time("pose", _points, pipeline, avatar, controls)
-        rows = to_flow(descriptors, points)
-        size = CROP_PIXELS // model.config.unet_unshuffle
-        image = watch.time("splat", splat, points, rows, size)
-        watch.time("warp and U-Net", model.paint_splat, image, portrait)
-        frame = watch.time("all of render", pipeline.render, avatar, controls)
-        watch.time("composite on colour", frame.over, (255, 255, 255))
-    return watch.table(f"Once per frame (median of {count})", skipped=WARM_UP)
-
-
-def _points(pipeline: Pipeline, avatar: Avatar, controls: Controls) -> torch.Tensor:
-    """Driven point projections (1, P, 3): ARKit map, head model, skinning, camera."""
-    pose = resolve(avatar.coefficients, avatar.camera, controls, pipeline.arkit)
-    return torch.from_numpy(pipeline.pose(avatar, *pose))[None]
+def table(report: dict[str, Any]) -> str:
+    lines = [f"{'threads':<24}{report['threads']:>9}"]
+    for key, title in TITLES.items():
+        if report[key] is None:
+            lines += ["", f"{title}: not installed (pip install 'cvthead[train]')"]
+            continue
+        lines += ["", f"{title:<42}{'median':>9}{'p95':>10}"]
+        lines += [
+            f"{stage:<42}{times['median_ms']:9.2f}{times['p95_ms']:10.2f} ms"
+            for stage, times in report[key].items()
+        ]
+    lines += [
+        f"{f'a frame is faster than {name} in PyTorch':<42}{ratio:8.1f}x"
+        for name, ratio in report["ratios"].items()
+    ]
+    return "\n".join(lines)

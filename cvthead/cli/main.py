@@ -7,13 +7,16 @@ import re
 import sys
 import warnings
 from collections.abc import Sequence
+from importlib import import_module
 from importlib.metadata import version
+from importlib.util import find_spec
 from typing import NoReturn, TextIO
 
-from cvthead.cli import animate, bench, encode, render, sweep, track
+from cvthead.cli import animate, bench, encode, import_official, render, sweep, track
 from cvthead.errors import CVTHeadError, InputError, SeveralFacesError
+from cvthead.runtime.threads import one_thread_per_call
 
-COMMANDS = (encode, render, animate, track, sweep, bench)
+COMMANDS = (encode, render, animate, track, sweep, bench, import_official)
 FAILED = 2
 INTERRUPTED = 130  # what shells report for a command ended by Ctrl-C
 
@@ -31,6 +34,9 @@ def parser() -> argparse.ArgumentParser:
     commands = result.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for module in COMMANDS:
         module.add_parser(commands)
+    # The service is a package of its own above this one, and may be left out.
+    if find_spec("service"):
+        import_module("service.cli").add_parser(commands)
     return result
 
 
@@ -40,6 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         0, or 2 after an error in the input, which is printed on one line of stderr.
     """
+    one_thread_per_call()
     with warnings.catch_warnings():
         warnings.simplefilter("default", UserWarning)
         warnings.showwarning = _show_warning

@@ -12,7 +12,6 @@ from cvthead.avatar import Avatar
 from cvthead.cli.motion_file import vector_controls
 from cvthead.cli.picture import (
     IMAGE_FORMATS,
-    Composer,
     add_picture_options,
     check_output,
     check_size,
@@ -20,6 +19,7 @@ from cvthead.cli.picture import (
 )
 from cvthead.cli.values import vector, weights
 from cvthead.coefficients import Coefficients
+from cvthead.composite import Composer
 from cvthead.controls import FIELDS, Controls, Mode
 from cvthead.pipeline import Pipeline
 

@@ -13,9 +13,10 @@ from PIL import Image, ImageDraw, ImageFont
 
 from cvthead.avatar import Avatar
 from cvthead.camera import CROP_PIXELS, Camera
-from cvthead.cli.picture import IMAGE_FORMATS, check_output, resampled, write_picture
+from cvthead.cli.picture import IMAGE_FORMATS, check_output, write_picture
 from cvthead.cli.portrait import add_portrait_options, read_avatar
 from cvthead.coefficients import EXPRESSION_SIZE, SHAPE_SIZE, Coefficients
+from cvthead.composite import resampled
 from cvthead.controls import Controls, resolve
 from cvthead.crop import head_crop
 from cvthead.errors import InputError

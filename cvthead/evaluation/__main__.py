@@ -44,7 +44,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"no clips in {options.data / 'clips' / 'val'}", file=sys.stderr)
         return 2
     try:
-        evaluate(paths, options.output, options.drivers, options.people, options.weights)
+        evaluate(paths, options.output, options.drivers, options.people, options.model)
     except CVTHeadError as error:
         print(f"{error}. {error.hint}", file=sys.stderr)
         return 1
@@ -52,10 +52,10 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def evaluate(
-    paths: list[Path], output: Path, drivers: int, people: int, weights: Path | None
+    paths: list[Path], output: Path, drivers: int, people: int, model: Path | None
 ) -> Report:
     """Score the clips and write ``index.html``, ``report.md`` and ``report.json`` to a folder."""
-    pipeline = Pipeline.load(weights=weights)
+    pipeline = Pipeline.load(model=model)
     evaluator = Evaluator(pipeline.tracker, pipeline.deformer, Metrics(), animate_with(pipeline))
     clips: list[Clip] = []
     for path in paths:
@@ -91,7 +91,7 @@ def parser() -> argparse.ArgumentParser:
     result = argparse.ArgumentParser("python -m cvthead.evaluation", description=__doc__)
     result.add_argument("--data", type=Path, required=True, help="folder with clips/val/*.mp4")
     result.add_argument("-o", "--output", type=Path, default=Path("local/evaluation"))
-    result.add_argument("--weights", type=Path, help="other weights than the packaged ones")
+    result.add_argument("--model", type=Path, help="folder of another model than the packaged one")
     result.add_argument("--drivers", type=int, default=8, help="driving frames per clip")
     result.add_argument("--every", type=int, default=1, help="take every n-th clip")
     result.add_argument("--people", type=int, default=8, help="people on the page")

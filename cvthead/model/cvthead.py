@@ -9,17 +9,18 @@ from cvthead.head.hierarchy import MeshHierarchy
 from cvthead.model.config import ModelConfig
 from cvthead.model.fill import fill
 from cvthead.model.light_unet import LightUNet
-from cvthead.model.pixel_aligned import PLACE_SIZE, PixelAlignedFusion
+from cvthead.model.pixel_aligned import PixelAlignedFusion
 from cvthead.model.positional import image_code, vertex_code
 from cvthead.model.pyramid_encoder import PyramidEncoder
 from cvthead.model.spiral import SpiralUpsampler
-from cvthead.model.splat import EMPTY_DEPTH, splat
+from cvthead.model.splat import splat
 from cvthead.model.transformer import Transformer
 from cvthead.model.warp import dense_flow, warp
 from cvthead.points import PointLayout
+from cvthead.runtime.networks import PLACE_SIZE
+from cvthead.runtime.splat import EMPTY_DEPTH
 
 FILL_LEVELS = 3
-CHANNELS_LAST = torch.channels_last
 
 
 class CVTHead(nn.Module):
@@ -109,27 +110,21 @@ class CVTHead(nn.Module):
         Returns:
             RGB (b, 3, size, size) in [-1, 1] and mask logits (b, 1, size, size).
         """
-        rows = to_flow(descriptors, points)
-        return self.paint_splat(splat(points, rows, size // self.config.unet_unshuffle), portrait)
-
-    def paint_splat(self, image: Tensor, portrait: Tensor) -> tuple[Tensor, Tensor]:
-        """The network half of :meth:`paint`, without the splat.
-
-        Args:
-            image: (b, 1 + C + 3, s, s) splat of descriptors after :func:`to_flow`.
-            portrait: (b, 4, 256, 256).
-        """
+        image = splat(points, to_flow(descriptors, points), size // self.config.unet_unshuffle)
+        flow, seen = image[:, -PLACE_SIZE:-1], image[:, -1:]
         with torch.autocast(image.device.type, enabled=False):
-            covered = (image[:, :1] > EMPTY_DEPTH).float()
-            flow, seen = image[:, -3:-1], image[:, -1:]
-            flow = dense_flow(flow, seen, image.shape[-1] * self.unet.unshuffle)
-            warped = warp(portrait, flow)
-            dense, coverage = fill(
-                image[:, : 1 + self.config.descriptor_size], covered, FILL_LEVELS
-            )
-        x = torch.cat([dense, seen, *coverage], dim=1)
-        out: tuple[Tensor, Tensor] = self.unet(x.contiguous(memory_format=CHANNELS_LAST), warped)
+            warped = warp(portrait, dense_flow(flow, seen, size))
+            filled = self.filled(torch.cat([image[:, :-PLACE_SIZE], seen], dim=1))
+        out: tuple[Tensor, Tensor] = self.unet(
+            filled.contiguous(memory_format=torch.channels_last), warped
+        )
         return out
+
+    def filled(self, image: Tensor) -> Tensor:
+        """Depth, descriptor and seen (b, 1 + C + 1, s, s) with holes -> the U-Net's input."""
+        covered = (image[:, :1] > EMPTY_DEPTH).float()
+        dense, coverage = fill(image[:, :-1], covered, FILL_LEVELS)
+        return torch.cat([dense, image[:, -1:], *coverage], dim=1)
 
 
 def to_flow(descriptors: Tensor, points: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-EPSILON = 1e-4
+from cvthead.runtime.warp import EPSILON
 
 
 def fill(values: Tensor, weight: Tensor, levels: int) -> tuple[Tensor, list[Tensor]]:

@@ -50,6 +50,10 @@ class LightUNet(nn.Module):
             mask logits (b, 1, h, w).
         """
         x = self.stem(torch.cat([splat, F.pixel_unshuffle(warped, self.unshuffle)], dim=1))
+        return self.after_stem(x, warped)
+
+    def after_stem(self, x: Tensor, warped: Tensor) -> tuple[Tensor, Tensor]:
+        """The rest of :meth:`forward` from the stem's output (b, sizes[0], h / u, w / u) on."""
         skips = []
         for down in self.downs:
             x = down(x)

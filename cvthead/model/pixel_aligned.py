@@ -14,7 +14,6 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 COLOUR_SIZE = 3
-PLACE_SIZE = 3  # x, y in the portrait, seen
 
 
 def sample(image: Tensor, points: Tensor) -> Tensor:

@@ -5,9 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-EMPTY_DEPTH = -2.0
-BLOCK = 4  # pixels; wide enough that the points of the front surface leave no block empty
-FRONT = 0.15  # thickness of the front surface in normalised depth, about 25 mm
+from cvthead.runtime.splat import BLOCK, EMPTY_DEPTH, FRONT
 
 
 def pixel_index(projected: Tensor, size: int) -> Tensor:

@@ -12,8 +12,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from cvthead.model.fill import fill, smooth
-
-FLOW_LEVELS = 4
+from cvthead.runtime.warp import FLOW_LEVELS
 
 
 def pixel_centres(size: int, like: Tensor) -> Tensor:

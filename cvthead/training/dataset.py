@@ -20,10 +20,10 @@ from torch.utils.data import Dataset
 
 from cvthead.deformation import MAX_SHELL_POINTS
 from cvthead.head.model import HeadModel
-from cvthead.points import PointLayout
+from cvthead.points import FAR_AWAY, PointLayout
 from cvthead.source import driven_points, network_input
 from cvthead.training.records import Frame, Record
-from cvthead.visibility import inside_mask
+from cvthead.visibility import inside_mask, on_person
 
 Array = NDArray[np.float32]
 
@@ -31,8 +31,6 @@ VIEWS = 2
 CLIP_SHARE = 0.6
 CANDIDATES = 3  # frames drawn per view of a clip; the one that differs most from the source stays
 ZOOM, SHIFT = 0.07, 0.04  # jitter of the source crop, relative to its size
-CUT_SHARE = 0.25  # sources whose picture ends below the chin
-CUT_RANGE = (0.72, 0.95)  # where, as a share of the crop
 STRONG_COLOUR_SHARE = 0.4
 
 
@@ -105,13 +103,13 @@ class PairDataset(Dataset[dict[str, Tensor]]):
             np.clip(colours(image.astype(np.float32) / np.float32(255)), 0, 1) * 255
         ).astype(np.uint8)
         views = [replace(v, image=np.clip(colours(v.image), 0, 1)) for v in views]
-        if rng.random() < CUT_SHARE:
-            mask = cut_below(mask, float(rng.uniform(*CUT_RANGE)))
         network = network_input(image, mask)
         visible *= inside_mask(own, mask)
+        drawn = on_person(own, mask)
         if rng.random() < 0.5:  # the whole sample seen in a mirror
             network = network[:, :, ::-1]
             own, visible = flip_points(own, self.layout), flip_order(visible, self.layout)
+            drawn = flip_order(drawn.astype(np.float32), self.layout) > 0
             anchor = self.head.mirror[anchor].astype(np.int64)
             views = [mirrored(v, self.layout) for v in views]
         stack: dict[str, NDArray[Any]] = {
@@ -124,7 +122,7 @@ class PairDataset(Dataset[dict[str, Tensor]]):
             "image": np.stack([self._resized(v.image).transpose(2, 0, 1) for v in views]),
             "mask": np.stack([self._resized(v.mask)[None] for v in views]),
             "valid": np.stack([self._resized(v.valid)[None] > 0.99 for v in views]),
-            "driven": np.stack([v.points for v in views]),
+            "driven": np.stack([np.where(drawn[:, None], v.points, FAR_AWAY) for v in views]),
         }
         return {
             name: torch.from_numpy(
@@ -181,13 +179,6 @@ def jittered(
     moved = points * np.float32(zoom)
     moved[:, :2] += shift.astype(np.float32)
     return image.astype(np.uint8), mask.astype(np.float32), moved
-
-
-def cut_below(mask: Array, share: float) -> Array:
-    """The person mask of a picture that ends ``share`` of the way down the crop."""
-    out = mask.copy()
-    out[round(share * len(mask)) :] = 0
-    return out
 
 
 @dataclass(frozen=True)

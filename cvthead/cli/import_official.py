@@ -1,0 +1,57 @@
+"""``cvthead import-official``: the released files become the official preset."""
+
+from __future__ import annotations
+
+import argparse
+from importlib.util import find_spec
+from pathlib import Path
+
+from cvthead.errors import InputError
+from cvthead.files import write_errors
+from cvthead.official.manifest import LICENCES, default_folder
+
+
+def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser(
+        "import-official",
+        help="import the files of the official CVTHead",
+        description="Check the files of the official CVTHead release and convert them for "
+        "--preset official. Nothing in them is run. Whoever imports them answers for their "
+        "licences, which are printed.",
+    )
+    parser.add_argument(
+        "folder",
+        type=Path,
+        metavar="DIR",
+        help="folder with cvthead.pt, transform.pkl and the files that cvthead.pt lacks",
+    )
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        metavar="FOLDER",
+        help=f"new folder for the converted model (default: {default_folder()})",
+    )
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> None:
+    for library in ("torch", "einops"):
+        if find_spec(library) is None:
+            raise InputError(
+                f"the official preset needs {library}",
+                hint='install with pip install "cvthead[train]"',
+            )
+    # PyTorch takes seconds to load and is not installed everywhere.
+    from cvthead.official.importer import import_official
+
+    output = args.output or default_folder()
+    if args.output is None:
+        with write_errors(output):
+            output.parent.mkdir(parents=True, exist_ok=True)
+    for source in import_official(args.folder, output):
+        print(f"{source.name}: {', '.join(source.used_for)}")
+    print("\nLicences of what was imported; none of it is part of cvthead:")
+    for licence in LICENCES:
+        print(f"- {licence.part}: {licence.licence}; {licence.page}")
+    print(f"\n{output}")

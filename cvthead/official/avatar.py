@@ -1,0 +1,154 @@
+"""An avatar of the official preset: all that depends on the source picture alone."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save as save_tensors
+
+from cvthead.camera import CROP_PIXELS, Camera
+from cvthead.coefficients import EXPRESSION_SIZE, POSE_SIZE, SHAPE_SIZE, Coefficients
+from cvthead.errors import AvatarFileError, CoefficientsError
+from cvthead.files import write_file
+from cvthead.model.config import PAPER
+from cvthead.official.crop import FaceSquare
+from cvthead.official.keys import released_shapes
+from cvthead.official.manifest import PRESET
+
+FORMAT = "cvthead-official-avatar"
+VERSION = "1"
+MAX_BYTES = 4 * 2**20
+VERTICES = released_shapes()["deform_mean"][0]
+ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
+    "descriptors": ("F32", (VERTICES, PAPER.descriptor_size)),
+    "offsets": ("F32", (VERTICES, 3)),
+    "shape": ("F32", (SHAPE_SIZE,)),
+    "expression": ("F32", (EXPRESSION_SIZE,)),
+    "pose": ("F32", (POSE_SIZE,)),
+    "camera": ("F64", (3,)),
+    "square": ("F64", (3,)),
+    "background": ("U8", (CROP_PIXELS, CROP_PIXELS, 3)),
+}
+
+Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class OfficialAvatar:
+    """One encoded portrait. Immutable; the encoder never runs again for it.
+
+    Attributes:
+        descriptors: (5023, 32), V_F of the paper's section 3.3.
+        offsets: (5023, 3) hair and shoulders in metres, added after posing: they do not turn
+            with the head, as in the released code.
+        coefficients: of the portrait, of FLAME.
+        camera: of the portrait, in the 256 x 256 picture's normalised coordinates.
+        square: what DECA saw of the picture.
+        background: (256, 256, 3) uint8 RGB, the picture with the person painted away.
+        fingerprint: of the weights that made it.
+    """
+
+    descriptors: Array
+    offsets: Array
+    coefficients: Coefficients
+    camera: Camera
+    square: FaceSquare
+    background: NDArray[np.uint8]
+    fingerprint: str
+
+    @property
+    def preset(self) -> str:
+        return PRESET
+
+    def to_bytes(self) -> bytes:
+        """One safetensors file."""
+        camera, square = self.camera, self.square
+        tensors = {
+            "descriptors": self.descriptors,
+            "offsets": self.offsets,
+            "shape": self.coefficients.shape,
+            "expression": self.coefficients.expression,
+            "pose": self.coefficients.pose,
+            "camera": np.array([camera.scale, camera.tx, camera.ty]),
+            "square": np.array([square.x, square.y, square.size]),
+            "background": self.background,
+        }
+        metadata = {
+            "format": FORMAT,
+            "version": VERSION,
+            "preset": self.preset,
+            "fingerprint": self.fingerprint,
+        }
+        contiguous = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
+        return save_tensors(contiguous, metadata=metadata)
+
+    def save(self, path: Path | str) -> None:
+        """Write the file; an existing one is replaced only when the new one is complete.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        write_file(path, self.to_bytes())
+
+    @classmethod
+    def load(cls, path: Path | str) -> OfficialAvatar:
+        """Read a file written by :meth:`save`; it may come from anywhere.
+
+        Raises:
+            AvatarFileError: missing, damaged, not such an avatar, or with impossible contents.
+        """
+        hint = "encode the portrait again"
+        try:
+            if Path(path).stat().st_size > MAX_BYTES:
+                raise ValueError(f"larger than {MAX_BYTES >> 20} MiB")
+            with safe_open(str(path), framework="np") as file:
+                metadata = file.metadata() or {}
+                if (metadata.get("format"), metadata.get("version")) != (FORMAT, VERSION):
+                    raise ValueError(f"its format is not {FORMAT} {VERSION}")
+                fingerprint = metadata.get("fingerprint", "")
+                if not re.fullmatch("[0-9a-f]{16}", fingerprint):
+                    raise ValueError("its fingerprint is missing or malformed")
+                arrays = {name: _array(file, name) for name in ARRAYS}
+            return _avatar(arrays, fingerprint)
+        except FileNotFoundError as error:
+            raise AvatarFileError(f"{path} does not exist", hint=hint) from error
+        except (SafetensorError, OSError, ValueError, CoefficientsError) as error:
+            raise AvatarFileError(
+                f"{path} is damaged or not an avatar of the official preset: {error}", hint=hint
+            ) from error
+
+
+def _array(file: Any, name: str) -> NDArray[Any]:
+    kind, shape = ARRAYS[name]
+    if name not in file.keys():  # noqa: SIM118  (not a mapping)
+        raise ValueError(f"{name} is missing")
+    header = file.get_slice(name)
+    found = header.get_dtype(), tuple(header.get_shape())
+    if found != (kind, shape):
+        raise ValueError(f"{name} is {found[0]} {found[1]}, expected {kind} {shape}")
+    array: NDArray[Any] = file.get_tensor(name)
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} holds NaN or infinity")
+    return array
+
+
+def _avatar(arrays: dict[str, NDArray[Any]], fingerprint: str) -> OfficialAvatar:
+    camera, square = Camera(*arrays["camera"].tolist()), FaceSquare(*arrays["square"].tolist())
+    camera.check()
+    if square.size < 1:
+        raise ValueError(f"the face square has size {square.size:g}")
+    return OfficialAvatar(
+        arrays["descriptors"],
+        arrays["offsets"],
+        Coefficients(arrays["shape"], arrays["expression"], arrays["pose"]),
+        camera,
+        square,
+        arrays["background"],
+        fingerprint,
+    )

@@ -1,0 +1,164 @@
+"""The imported model's folder: safetensors files and ``model.json``, which vouches for them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from cvthead.errors import AssetError
+from cvthead.files import write_file
+
+RECORD = "model.json"
+VERSION = 1
+PRESET = "official"
+NETWORK = "cvthead.safetensors"
+PARSING = "face_parsing.safetensors"
+HAIR = "hair.safetensors"
+DECA = "deca.safetensors"
+FLAME = "flame.safetensors"
+MESH = "mesh.safetensors"
+FILES = (NETWORK, PARSING, HAIR, DECA, FLAME, MESH)
+HINT = "import the official files again with `cvthead import-official`"
+FOLDER_VARIABLE = "CVTHEAD_OFFICIAL"
+
+
+@dataclass(frozen=True)
+class Licence:
+    """What a part of the official files may be used for. No legal advice: the page decides."""
+
+    part: str
+    licence: str
+    page: str
+
+
+LICENCES = (
+    Licence(
+        "CVTHead weights and tables (cvthead.pt, data/)",
+        "published without a licence: all rights are the authors'",
+        "https://github.com/HowieMa/CVTHead",
+    ),
+    Licence(
+        "FLAME head model",
+        "the licence accepted at the download; FLAME 2020: non-commercial research only",
+        "https://flame.is.tue.mpg.de/modellicense.html",
+    ),
+    Licence(
+        "DECA encoder",
+        "Max Planck licence, non-commercial research only",
+        "https://github.com/yfeng95/DECA/blob/master/LICENSE",
+    ),
+    Licence(
+        "ROME hair model and image encoder",
+        "non-commercial use only",
+        "https://github.com/SamsungLabs/rome",
+    ),
+    Licence(
+        "BiSeNet face parsing",
+        "code MIT; trained on CelebAMask-HQ, a data set for non-commercial research",
+        "https://github.com/zllrunning/face-parsing.PyTorch",
+    ),
+)
+
+
+@dataclass(frozen=True)
+class SourceFile:
+    """A file that was imported."""
+
+    name: str
+    sha256: str
+    used_for: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """Checked contents of ``model.json``.
+
+    Attributes:
+        folder: where it lies.
+        fingerprint: 16 hex digits of all weights; avatars remember it.
+        sources: the files it was made from.
+        sha256: of each safetensors file.
+    """
+
+    folder: Path
+    fingerprint: str
+    sources: tuple[SourceFile, ...]
+    sha256: Mapping[str, str]
+
+    @classmethod
+    def load(cls, folder: Path) -> Manifest:
+        """Read ``model.json``.
+
+        Raises:
+            AssetError: nothing was imported there, or it is malformed.
+        """
+        path = folder / RECORD
+        if not path.is_file():
+            raise AssetError(
+                f"the official model is not in {folder}",
+                hint="import the official files with `cvthead import-official DIR`",
+            )
+        try:
+            record: dict[str, Any] = json.loads(path.read_text("utf-8"))
+            if (record["preset"], record["version"]) != (PRESET, VERSION):
+                raise ValueError(f"preset {record['preset']!r}, version {record['version']!r}")
+            sources = tuple(
+                SourceFile(str(s["name"]), str(s["sha256"]), tuple(map(str, s["used_for"])))
+                for s in record["sources"]
+            )
+            sha256 = {name: str(record["sha256"][name]) for name in FILES}
+            fingerprint = str(record["fingerprint"])
+            if not re.fullmatch("[0-9a-f]{16}", fingerprint):
+                raise ValueError("no fingerprint")
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise AssetError(f"{path} is not an imported model: {error!r}", hint=HINT) from error
+        return cls(folder, fingerprint, sources, sha256)
+
+    def checked(self, name: str) -> Path:
+        """Path of one of FILES, after comparing its hash.
+
+        Raises:
+            AssetError: missing or altered.
+        """
+        path = self.folder / name
+        try:
+            found = file_sha256(path)
+        except OSError as error:
+            raise AssetError(f"{path} is missing", hint=HINT) from error
+        if found != self.sha256[name]:
+            raise AssetError(f"{path} is not the imported file", hint=HINT)
+        return path
+
+
+def write_manifest(folder: Path, sources: tuple[SourceFile, ...]) -> None:
+    """Write ``model.json`` for the FILES in ``folder``."""
+    sha256 = {name: file_sha256(folder / name) for name in FILES}
+    digest = hashlib.sha256("".join(sha256[name] for name in FILES).encode())
+    record = {
+        "preset": PRESET,
+        "version": VERSION,
+        "fingerprint": digest.hexdigest()[:16],
+        "sources": [asdict(source) for source in sources],
+        "licences": [asdict(licence) for licence in LICENCES],
+        "sha256": sha256,
+    }
+    write_file(folder / RECORD, (json.dumps(record, indent=2) + "\n").encode())
+
+
+def file_sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def default_folder() -> Path:
+    """Where the import goes and the preset is looked for: CVTHEAD_OFFICIAL, or the user's data."""
+    if chosen := os.environ.get(FOLDER_VARIABLE):
+        return Path(chosen)
+    data = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
+    return Path(data) / "cvthead" / PRESET

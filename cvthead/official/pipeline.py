@@ -1,0 +1,326 @@
+"""The official preset: encode(image) -> avatar once, render(avatar, controls) -> frame.
+
+The released code computes everything anew for every frame. Here encoding runs parsing, hair
+model, DECA, image encoder and transformer once; a frame by coefficients costs head, splat and
+U-Net, a driving frame one DECA pass more.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from cvthead.camera import CROP_PIXELS, Camera
+from cvthead.coefficients import Coefficients
+from cvthead.controls import Controls, resolve
+from cvthead.crop import head_crop
+from cvthead.errors import ModelChangedError
+from cvthead.frame import Frame
+from cvthead.head.arkit import ArkitMap
+from cvthead.head.model import HeadModel
+from cvthead.model.deca import split_codes
+from cvthead.model.paper import over_white
+from cvthead.official.arkit import fit_arkit
+from cvthead.official.avatar import OfficialAvatar
+from cvthead.official.crop import FaceSquare
+from cvthead.official.manifest import PRESET, default_folder
+from cvthead.official.networks import OfficialNetworks, picture_tensor
+from cvthead.tracking.landmarks68 import landmarks68
+from cvthead.tracking.tracker import TrackedFace, Tracker
+
+Array = NDArray[np.float32]
+Image = NDArray[np.uint8]
+
+INPAINT_MARGIN = 9
+SMALL = CROP_PIXELS // 4
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """What one DECA pass says of a face: FLAME coefficients and its raw camera."""
+
+    coefficients: Coefficients
+    cam: Array
+
+
+class Driven(NamedTuple):
+    """A frame to render, as a driving picture asks for it; unpacks into the arguments of
+    :meth:`OfficialPipeline.render_coefficients`.
+
+    Attributes:
+        coefficients: the driver's expression and pose on the avatar's shape.
+        camera: in the 256 x 256 picture's normalised coordinates.
+        square: whose unit the depth is in.
+    """
+
+    coefficients: Coefficients
+    camera: Camera
+    square: FaceSquare
+
+
+@dataclass(frozen=True, eq=False)
+class OfficialPipeline:
+    """The imported model. Immutable; safe to share between threads."""
+
+    networks: OfficialNetworks
+    head: HeadModel
+    arkit: ArkitMap
+    tracker: Tracker
+
+    @classmethod
+    def load(cls, folder: Path | None = None) -> OfficialPipeline:
+        """Load an imported model.
+
+        Args:
+            folder: of the import; None takes :func:`default_folder`.
+
+        Raises:
+            AssetError: nothing was imported there, or it is damaged.
+        """
+        networks = OfficialNetworks.load(folder or default_folder())
+        tracker = Tracker.load()
+        arkit = fit_arkit(networks.flame, tracker.head, ArkitMap.load())
+        return cls(networks, networks.flame.head(), arkit, tracker)
+
+    @property
+    def preset(self) -> str:
+        return PRESET
+
+    @property
+    def fingerprint(self) -> str:
+        """Of the imported weights; an avatar made with others is refused."""
+        return self.networks.manifest.fingerprint
+
+    def encode(
+        self,
+        image: Image,
+        *,
+        face: int | None = None,
+        only_one: bool = False,
+        deform: bool = True,
+    ) -> OfficialAvatar:
+        """Turn a portrait into an avatar.
+
+        The picture is cut to a square around the head, for the released model was trained on
+        such crops; :meth:`encode_picture` takes one as it is.
+
+        Args:
+            image: (H, W, 3) uint8 RGB.
+            face, only_one: as :meth:`cvthead.pipeline.Pipeline.encode`.
+            deform: False leaves out hair and shoulders.
+
+        Raises:
+            ImageError, FaceError: as :meth:`cvthead.tracking.tracker.Tracker.track`.
+        """
+        tracked = self.tracker.track(image, face=face, only_one=only_one)
+        return self.encode_picture(*self._cut(image, tracked), deform=deform)
+
+    @torch.inference_mode()
+    def encode_picture(
+        self, picture: Image, landmarks: NDArray[np.floating], *, deform: bool = True
+    ) -> OfficialAvatar:
+        """Turn a 256 x 256 picture into an avatar, as the released code does.
+
+        Args:
+            picture: (256, 256, 3) uint8 RGB, whole head in view.
+            landmarks: (68, 2) in its pixels, the first pixel's centre at 0.
+            deform: False leaves out hair and shoulders.
+        """
+        networks = self.networks
+        image = picture_tensor(picture)
+        mask = networks.parsing.mask(image)
+        square = FaceSquare.around(landmarks)
+        estimate = self.estimate(picture, square)
+        offsets = networks.hair(image)[0].numpy() if deform else np.zeros_like(self.head.template)
+        camera = square.camera(estimate.cam)
+        points = self._project(estimate.coefficients, camera, offsets, square)
+        source = torch.cat([image, mask], dim=1)
+        descriptors = networks.network.describe(source, torch.from_numpy(points)[None])
+        return OfficialAvatar(
+            descriptors[0].numpy(),
+            offsets,
+            estimate.coefficients,
+            camera,
+            square,
+            without_person(picture, mask[0, 0].numpy() > 0),
+            self.fingerprint,
+        )
+
+    @torch.inference_mode()
+    def estimate(self, picture: Image, square: FaceSquare) -> Estimate:
+        """One DECA pass: coefficients of the face in ``square`` of a 256 x 256 picture."""
+        crop = torch.from_numpy(square.cut(picture))[None]
+        codes = {k: v.numpy() for k, v in split_codes(self.networks.deca(crop)[0]).items()}
+        return Estimate(
+            Coefficients(codes["shape"], codes["exp"], self.full_pose(codes["pose"])), codes["cam"]
+        )
+
+    def full_pose(self, pose: NDArray[np.floating]) -> Array:
+        """DECA's six (global and jaw rotation) -> (15,); neck and eyes as FLAME rests."""
+        full = self.networks.flame.rest_pose.copy()
+        full[:3], full[6:9] = pose[:3], pose[3:]
+        return full
+
+    def drive(
+        self,
+        avatar: OfficialAvatar,
+        image: Image,
+        *,
+        cross_identity: bool = True,
+        previous: TrackedFace | None = None,
+    ) -> Driven:
+        """What a driving picture makes the avatar do: one DECA pass.
+
+        Args:
+            avatar: whose shape is kept.
+            image: (H, W, 3) uint8 RGB.
+            cross_identity: as :meth:`drive_picture`.
+            previous: the same face in the driving frame before.
+
+        Raises:
+            ImageError, FaceError: as :meth:`cvthead.tracking.tracker.Tracker.track`.
+        """
+        picture, landmarks = self._cut(image, self.tracker.track(image, previous=previous))
+        return self.drive_picture(avatar, picture, landmarks, cross_identity=cross_identity)
+
+    def drive_picture(
+        self,
+        avatar: OfficialAvatar,
+        picture: Image,
+        landmarks: NDArray[np.floating],
+        *,
+        cross_identity: bool = True,
+    ) -> Driven:
+        """As :meth:`drive`, of a 256 x 256 picture and its landmarks.
+
+        Args:
+            avatar, picture, landmarks: as :meth:`encode_picture`.
+            cross_identity: True places the driver's DECA camera in the avatar's face square, so
+                that the head stays where the portrait has it; False places the head where the
+                driving picture has it (the released code's ``is_cross_id``).
+        """
+        square = FaceSquare.around(landmarks)
+        driver = self.estimate(picture, square)
+        coefficients = replace(driver.coefficients, shape=avatar.coefficients.shape)
+        placed = avatar.square if cross_identity else square
+        return Driven(coefficients, placed.camera(driver.cam), placed)
+
+    def render(self, avatar: OfficialAvatar, controls: Controls | None = None) -> Frame:
+        """Render the avatar as the controls ask; absent ones keep the portrait's values.
+
+        Expression goes into FLAME's expression. (The released code's demo writes it into shape.)
+
+        Raises:
+            ModelChangedError: the avatar was made with other weights.
+            CoefficientsError: an unknown ARKit name or a value out of range.
+        """
+        coefficients, camera = resolve(
+            avatar.coefficients, avatar.camera, controls or Controls(), self.arkit
+        )
+        return self.render_coefficients(avatar, coefficients, camera)
+
+    def render_coefficients(
+        self,
+        avatar: OfficialAvatar,
+        coefficients: Coefficients,
+        camera: Camera,
+        square: FaceSquare | None = None,
+    ) -> Frame:
+        """Render full coefficients seen by a normalised camera.
+
+        Args:
+            avatar: what to render.
+            coefficients: of FLAME.
+            camera: in the 256 x 256 picture's normalised coordinates.
+            square: whose unit the depth is in (see :class:`Driven`); None takes the avatar's.
+
+        Raises:
+            ModelChangedError: as :meth:`render`.
+        """
+        rgb, logits = self.paint(avatar, self.pose(avatar, coefficients, camera, square))
+        painted = torch.cat([0.5 * (rgb + 1), torch.sigmoid(logits)], dim=1)
+        pixels = (painted * 255).round().to(torch.uint8)[0].permute(1, 2, 0).numpy()
+        return Frame(np.ascontiguousarray(pixels[..., :3]), np.ascontiguousarray(pixels[..., 3]))
+
+    def white(
+        self,
+        avatar: OfficialAvatar,
+        coefficients: Coefficients,
+        camera: Camera,
+        square: FaceSquare | None = None,
+        *,
+        threshold: float | None = None,
+    ) -> Image:
+        """(256, 256, 3) the released code's own output: over white, truncated to uint8.
+
+        Args:
+            avatar, coefficients, camera, square: as :meth:`render_coefficients`.
+            threshold: None blends by the mask; HARD_MASK cuts it as the released evaluation does.
+        """
+        rgb, logits = self.paint(avatar, self.pose(avatar, coefficients, camera, square))
+        return over_white(rgb, logits, threshold)[0].numpy()
+
+    def pose(
+        self,
+        avatar: OfficialAvatar,
+        coefficients: Coefficients,
+        camera: Camera,
+        square: FaceSquare | None = None,
+    ) -> Array:
+        """Driven vertex projections (5023, 3): head model, skinning, hair, camera.
+
+        Raises:
+            ModelChangedError: as :meth:`render`.
+        """
+        if avatar.fingerprint != self.fingerprint:
+            raise ModelChangedError(
+                f"the avatar was made with weights {avatar.fingerprint}, "
+                f"this model has {self.fingerprint}",
+                hint="encode the portrait again",
+            )
+        return self._project(coefficients, camera, avatar.offsets, square or avatar.square)
+
+    @torch.inference_mode()
+    def paint(self, avatar: OfficialAvatar, points: Array) -> tuple[Tensor, Tensor]:
+        """Splat and U-Net: RGB (1, 3, 256, 256) in [-1, 1] and mask logits (1, 1, 256, 256)."""
+        descriptors = torch.from_numpy(avatar.descriptors)[None]
+        return self.networks.network.paint(torch.from_numpy(points)[None], descriptors, CROP_PIXELS)
+
+    def background(self, avatar: OfficialAvatar) -> Image:
+        """(256, 256, 3) uint8 RGB: the portrait's crop with the person painted away."""
+        return avatar.background
+
+    def _project(
+        self, coefficients: Coefficients, camera: Camera, offsets: Array, square: FaceSquare
+    ) -> Array:
+        points = camera.project(self.head.vertices(coefficients) + offsets)
+        points[:, 2] *= np.float32(square.depth_ratio)
+        return points
+
+    def _cut(self, image: Image, tracked: TrackedFace) -> tuple[Image, NDArray[np.float64]]:
+        """The square around a tracked head, and the 68 landmarks in its pixels."""
+        crop = head_crop(self.tracker.head, tracked.coefficients, tracked.camera)
+        picture, _ = crop.cut(image)
+        landmarks = landmarks68(tracked.landmarks)[:, :2] - (crop.left, crop.top)
+        # The tracker counts the first pixel's centre as 0.5, the released code as 0.
+        return picture, landmarks * (CROP_PIXELS / crop.size) - 0.5
+
+
+def without_person(picture: Image, person: NDArray[np.bool_]) -> Image:
+    """(256, 256, 3) picture with the person filled from the background around."""
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (INPAINT_MARGIN,) * 2)
+    wide = cv2.dilate(person.astype(np.uint8), kernel)
+    small = cv2.resize(picture, (SMALL, SMALL), interpolation=cv2.INTER_AREA)
+    hole = cv2.resize(wide * 255, (SMALL, SMALL), interpolation=cv2.INTER_AREA) > 0
+    filled = cv2.inpaint(small, hole.astype(np.uint8), 3, cv2.INPAINT_TELEA)
+    filled = cv2.resize(filled, (CROP_PIXELS, CROP_PIXELS), interpolation=cv2.INTER_CUBIC)
+    soft = cv2.GaussianBlur(wide.astype(np.float32), (0, 0), 3)[..., None]
+    soft = np.maximum(soft, wide[..., None])
+    return np.asarray(picture * (1 - soft) + filled * soft, dtype=np.uint8)

@@ -1,0 +1,1 @@
+"""The networks as onnxruntime serves them; nothing here imports torch."""

@@ -1,0 +1,64 @@
+"""``GET /v1/models``: what is loaded, what it takes, under which licences."""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+
+from fastapi import APIRouter
+from pydantic import BaseModel, Field
+
+from cvthead.camera import CROP_PIXELS
+from cvthead.coefficients import EXPRESSION_SIZE, JOINTS, SHAPE_SIZE
+from cvthead.head.arkit import ARKIT_NAMES
+from service.state import ServiceDep
+
+router = APIRouter()
+
+
+class Licences(BaseModel):
+    """SPDX identifiers; NOTICE has the sources."""
+
+    code: str = Field(default="Apache-2.0", description="Of the software.")
+    weights: str = Field(default="Apache-2.0", description="Of the trained weights.")
+    head: str = Field(default="CC0-1.0", description="Of the head model (MakeHuman).")
+    networks: str = Field(default="Apache-2.0", description="Of the face networks (MediaPipe).")
+
+
+class ModelInfo(BaseModel):
+    """A loaded preset."""
+
+    preset: str = Field(description="Name of the preset.", examples=["open"])
+    fingerprint: str = Field(
+        description="Of the trained weights; avatars of others answer 409 `model_changed`.",
+        examples=["0123456789abcdef"],
+    )
+    version: str = Field(description="Of the software.", examples=["0.1.0"])
+    frame_size: int = Field(description="Side of a frame as it is rendered, in pixels.")
+    shape: int = Field(description="Number of shape coefficients.")
+    expression: int = Field(description="Number of expression coefficients.")
+    pose: list[str] = Field(description="Joints; each is an axis-angle of 3 numbers, radians.")
+    arkit: list[str] = Field(description="Blendshape names that `arkit` takes, each 0 to 1.")
+    licences: Licences
+
+
+class Models(BaseModel):
+    """The loaded presets."""
+
+    items: list[ModelInfo]
+
+
+@router.get("/v1/models", tags=["operation"], summary="What is loaded")
+async def models(service: ServiceDep) -> Models:
+    pipeline = service.pipeline
+    info = ModelInfo(
+        preset=pipeline.preset,
+        fingerprint=pipeline.fingerprint,
+        version=version("cvthead"),
+        frame_size=CROP_PIXELS,
+        shape=SHAPE_SIZE,
+        expression=EXPRESSION_SIZE,
+        pose=list(JOINTS),
+        arkit=list(ARKIT_NAMES),
+        licences=Licences(),
+    )
+    return Models(items=[info])
