@@ -94,7 +94,7 @@ def time_drive(
         start = time.perf_counter()
         picture = watch.time("decode JPEG", decode_image, data)
         previous = watch.time("track", _track, pipeline, picture, previous)
-        coefficients, camera = drive(avatar, previous)
+        coefficients, camera = drive(pipeline.head, avatar, previous)
         frame = watch.time("render", pipeline.render_coefficients, avatar, coefficients, camera)
         watch.time("to JPEG", encode_image, frame.over((255, 255, 255)), "jpeg")
         watch.samples.setdefault("JPEG to JPEG", []).append((time.perf_counter() - start) * 1000)

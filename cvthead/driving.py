@@ -3,18 +3,33 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Protocol
 
+import cv2
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from cvthead.avatar import Avatar
 from cvthead.camera import Camera, Crop
 from cvthead.coefficients import JOINTS, Coefficients
 from cvthead.controls import composed
+from cvthead.head.model import HeadModel, Region
 from cvthead.tracking.tracker import TrackedFace
+
+HEAD = JOINTS.index("neck")  # the joint that carries the skull
+
+
+class Driven(Protocol):
+    """The part of an avatar, of any preset, that driving needs."""
+
+    @property
+    def coefficients(self) -> Coefficients: ...
+    @property
+    def camera(self) -> Camera: ...
 
 
 def drive(
-    avatar: Avatar,
+    head: HeadModel,
+    avatar: Driven,
     face: TrackedFace,
     *,
     reference: TrackedFace | None = None,
@@ -22,7 +37,10 @@ def drive(
 ) -> tuple[Coefficients, Camera]:
     """Expression and pose of the driver on the avatar's identity (paper equation 2).
 
+    The head turns at the neck; the shoulders stay as in the portrait, see :func:`at_neck`.
+
     Args:
+        head: the head model of both.
         avatar: whose shape, hair and descriptors are kept.
         face: the tracked driving frame.
         reference: a driving frame in which the driver looks as the source does. When given, the
@@ -41,7 +59,46 @@ def drive(
         )
         if crop is not None:
             camera = _moved(avatar.camera, reference.camera.in_crop(crop), camera)
-    return replace(source, expression=expression, pose=pose), camera
+    wanted = replace(source, expression=expression, pose=pose)
+    if crop is None:
+        return _turned(source, wanted), camera
+    return at_neck(head, source, wanted, camera)
+
+
+def at_neck(
+    head: HeadModel, source: Coefficients, wanted: Coefficients, camera: Camera
+) -> tuple[Coefficients, Camera]:
+    """The wanted head in the same place, on shoulders that stand as the source's do.
+
+    A tracker sees the face alone and gives its whole turn to the global joint. People turn their
+    heads at the neck: moved to that joint, the same picture of the face leaves the body still.
+
+    Args:
+        head: the head model.
+        source: coefficients of the portrait.
+        wanted: coefficients of the driven frame.
+        camera: of the driven frame; the result's is shifted so that the face does not move.
+    """
+    turned = _turned(source, wanted)
+    rest = head.rest(wanted)
+    centre = np.append(rest[head.region == Region.FACE].mean(axis=0), 1)
+    joints = head.joints(rest)
+    x, y, _ = (
+        head.transforms(wanted.pose, joints)[HEAD] - head.transforms(turned.pose, joints)[HEAD]
+    ) @ centre
+    return turned, Camera(camera.scale, camera.tx + float(x), camera.ty + float(y))
+
+
+def _turned(source: Coefficients, wanted: Coefficients) -> Coefficients:
+    """``wanted`` with the source's global rotation and the rest of the head's turn at the neck."""
+    body = _matrix(source.joint("global"))
+    skull = _matrix(wanted.joint("global")) @ _matrix(wanted.joint("neck"))
+    neck = cv2.Rodrigues(body.T @ skull)[0].ravel()
+    return wanted.with_joints({"global": source.joint("global"), "neck": neck})
+
+
+def _matrix(rotation: ArrayLike) -> NDArray[np.float64]:
+    return np.asarray(cv2.Rodrigues(np.asarray(rotation, np.float64))[0], np.float64)
 
 
 def _moved(source: Camera, start: Camera, now: Camera) -> Camera:

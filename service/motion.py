@@ -51,14 +51,14 @@ class Motion:
             avatar, arkit = self._avatar, self._engine.pipeline.arkit
             return resolve(avatar.coefficients, avatar.camera, controls, arkit)
         face = await self._face(message)
+        head = self._engine.pipeline.head
         # Without a reference frame the first one serves.
         if self._reference is None or message.kind is Kind.REFERENCE:
             self._reference = face
             if self._hello.camera == "driver":
-                head = self._engine.pipeline.head
                 self._crop = head_crop(head, face.coefficients, face.camera)
         reference = self._reference if self._hello.mode == "relative" else None
-        return drive(self._avatar, face, reference=reference, crop=self._crop)
+        return drive(head, self._avatar, face, reference=reference, crop=self._crop)
 
     async def _face(self, message: Message) -> TrackedFace:
         image = shrink(await self._engine.decode(message.payload), LONGEST_SIDE)

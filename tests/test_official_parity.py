@@ -28,6 +28,7 @@ from cvthead.official.importer import import_official
 from cvthead.official.mesh import read_hierarchy
 from cvthead.official.networks import picture_tensor
 from cvthead.official.pipeline import OfficialPipeline
+from cvthead.official.tracker import Picture
 
 NETWORK_TOLERANCE = 1e-3  # of the array's standard deviation
 GEOMETRY_TOLERANCE = 1e-5
@@ -80,7 +81,7 @@ def fixed_parts(shared: Path) -> dict[str, torch.Tensor]:
 
 @pytest.fixture(scope="module")
 def avatar(pipeline: OfficialPipeline, inputs: official.Arrays) -> OfficialAvatar:
-    return pipeline.encode_picture(inputs["src"], inputs["lmk_src"])
+    return pipeline.encode_picture(Picture(inputs["src"], inputs["lmk_src"]))
 
 
 def assert_close(found: NDArray[Any], expected: NDArray[Any]) -> None:
@@ -125,7 +126,7 @@ def test_deca(
     codes = pipeline.networks.deca(torch.from_numpy(inputs["src_crop"])[None])[0].numpy()
     assert_close(codes, reference["deca_codes"])
     square = FaceSquare.around(inputs["lmk_src"])
-    estimate = pipeline.estimate(inputs["src"], square)
+    estimate = pipeline.tracker.estimate(inputs["src"], square)
     vertices = pipeline.head.vertices(estimate.coefficients)
     assert_near(vertices, reference["src_verts"])
     assert_close(estimate.cam, reference["deca_codes"][206:209])
@@ -153,7 +154,7 @@ def test_driven_by_pose(
     reference: official.Arrays,
 ) -> None:
     assert_near(pipeline.pose(avatar, avatar.coefficients, avatar.camera), reference["src_proj"])
-    driven = replace(avatar.coefficients, pose=pipeline.full_pose(inputs["pose_a"][0]))
+    driven = replace(avatar.coefficients, pose=pipeline.tracker.full_pose(inputs["pose_a"][0]))
     points = pipeline.pose(avatar, driven, avatar.camera)
     assert_near(points, reference["drv_proj"])
 
@@ -180,10 +181,10 @@ def test_driven_by_face(
 ) -> None:
     """Driver's expression, pose and camera; its tform only in self-reenactment."""
     driven = pipeline.drive_picture(
-        avatar, inputs["drv"], inputs["lmk_drv"], cross_identity=cross_identity
+        avatar, Picture(inputs["drv"], inputs["lmk_drv"]), cross_identity=cross_identity
     )
     coefficients = driven.coefficients
-    driver = pipeline.estimate(inputs["drv"], FaceSquare.around(inputs["lmk_drv"]))
+    driver = pipeline.tracker.estimate(inputs["drv"], FaceSquare.around(inputs["lmk_drv"]))
     assert np.array_equal(coefficients.shape, avatar.coefficients.shape)
     assert np.array_equal(coefficients.expression, driver.coefficients.expression)
     assert np.array_equal(coefficients.pose, driver.coefficients.pose)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 
-from cvthead.avatar import Avatar
 from cvthead.cli.driver import Drive, Options, open_driver
 from cvthead.cli.picture import (
     IMAGE_FORMATS,
@@ -18,7 +18,7 @@ from cvthead.cli.picture import (
 )
 from cvthead.cli.portrait import add_portrait_options, read_avatar
 from cvthead.composite import Composer
-from cvthead.pipeline import Pipeline
+from cvthead.preset import AnyAvatar, Preset, load_preset
 from cvthead.video_writer import video_writer
 
 VIDEO_ENDINGS = (".mp4", ".gif", ".png", "")
@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> None:
     endings = tuple(dict.fromkeys([*VIDEO_ENDINGS, *IMAGE_FORMATS]))
     check_output(args.output, endings, alpha=args.background == "transparent")
     check_size(args.size)
-    pipeline = Pipeline.load(args.preset)
+    pipeline = load_preset(args.preset)
     avatar = read_avatar(pipeline, args.portrait, args.face)
     options = Options(args.relative, args.camera == "driver", not args.no_smoothing)
     drive = open_driver(args.driving, pipeline, avatar, options)
@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _write_video(
-    path: Path, pipeline: Pipeline, avatar: Avatar, drive: Drive, composer: Composer
+    path: Path, pipeline: Preset[Any], avatar: AnyAvatar, drive: Drive, composer: Composer
 ) -> None:
     with video_writer(
         path,

@@ -6,9 +6,8 @@ import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from cvthead.avatar import Avatar
 from cvthead.camera import Camera, Crop
 from cvthead.cli.motion_file import read_motion
 from cvthead.cli.picture import IMAGE_FORMATS
@@ -18,9 +17,9 @@ from cvthead.crop import head_crop
 from cvthead.driving import drive
 from cvthead.errors import FaceError, InputError, NoFaceError
 from cvthead.images import read_image
-from cvthead.pipeline import Pipeline
+from cvthead.preset import AnyAvatar, FaceTracker, Preset
 from cvthead.tracking.one_euro import FaceFilter
-from cvthead.tracking.tracker import FaceTurnedWarning, TrackedFace, Tracker
+from cvthead.tracking.tracker import FaceTurnedWarning, TrackedFace
 from cvthead.video import probe_video, read_frames
 
 
@@ -64,7 +63,7 @@ class Drive:
     audio: Path | None
 
 
-def open_driver(path: Path, pipeline: Pipeline, avatar: Avatar, options: Options) -> Drive:
+def open_driver(path: Path, pipeline: Preset[Any], avatar: AnyAvatar, options: Options) -> Drive:
     """Open a driver by its ending: .json, a picture, or else a video.
 
     Raises:
@@ -90,14 +89,17 @@ def open_driver(path: Path, pipeline: Pipeline, avatar: Avatar, options: Options
             )
         face = pipeline.tracker.track(read_image(path))
         crop = _crop(pipeline.tracker, face, options)
-        return Drive(iter([Step(*drive(avatar, face, crop=crop), 0.0)]), 1, 1.0, None)
+        pose = drive(pipeline.head, avatar, face, crop=crop)
+        return Drive(iter([Step(*pose, 0.0)]), 1, 1.0, None)
     info = probe_video(path)
     audio = path if info.has_audio else None
     steps_of_video = _video_steps(path, pipeline.tracker, avatar, options)
     return Drive(steps_of_video, info.frames, info.fps, audio)
 
 
-def _video_steps(path: Path, tracker: Tracker, avatar: Avatar, options: Options) -> Iterator[Step]:
+def _video_steps(
+    path: Path, tracker: FaceTracker, avatar: AnyAvatar, options: Options
+) -> Iterator[Step]:
     """Track frame by frame. Where the face is lost the latest pose holds; the portrait's before."""
     latest = avatar.coefficients, avatar.camera
     previous: TrackedFace | None = None
@@ -127,7 +129,8 @@ def _video_steps(path: Path, tracker: Tracker, avatar: Avatar, options: Options)
         if reference is None:
             reference = face
             crop = _crop(tracker, face, options)
-        latest = drive(avatar, face, reference=reference if options.relative else None, crop=crop)
+        start = reference if options.relative else None
+        latest = drive(tracker.head, avatar, face, reference=start, crop=crop)
         yield Step(*latest, time)
     if lost == count:
         raise NoFaceError(
@@ -139,7 +142,7 @@ def _video_steps(path: Path, tracker: Tracker, avatar: Avatar, options: Options)
         )
 
 
-def _crop(tracker: Tracker, face: TrackedFace, options: Options) -> Crop | None:
+def _crop(tracker: FaceTracker, face: TrackedFace, options: Options) -> Crop | None:
     if not options.driver_camera:
         return None
     return head_crop(tracker.head, face.coefficients, face.camera)

@@ -8,7 +8,7 @@ from pathlib import Path
 from cvthead.cli.picture import check_output
 from cvthead.cli.portrait import add_portrait_options
 from cvthead.images import read_image
-from cvthead.pipeline import Pipeline
+from cvthead.preset import load_preset
 
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -34,7 +34,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 def run(args: argparse.Namespace) -> None:
     check_output(args.output, (".avatar",), alpha=False)
     image = read_image(args.portrait)
-    pipeline = Pipeline.load(args.preset)
+    pipeline = load_preset(args.preset)
     avatar = pipeline.encode(
         image, face=args.face, only_one=args.only_one, deform=not args.no_deformation
     )

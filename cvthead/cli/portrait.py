@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from cvthead.avatar import Avatar
 from cvthead.errors import InputError
 from cvthead.images import read_image
-from cvthead.pipeline import Pipeline
+from cvthead.official.avatar import OfficialAvatar, is_official
+from cvthead.preset import PRESETS, Preset
 
 
 def add_portrait_options(parser: argparse.ArgumentParser, name: str, what: str) -> None:
@@ -21,7 +23,10 @@ def add_portrait_options(parser: argparse.ArgumentParser, name: str, what: str) 
 
 def add_preset_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--preset", type=preset, default="open", help="model to use (default and only one: open)"
+        "--preset",
+        type=preset,
+        default="open",
+        help="model to use: open (default), or official after `cvthead import-official`",
     )
 
 
@@ -29,23 +34,33 @@ def preset(name: str) -> str:
     """Parse ``--preset``.
 
     Raises:
-        InputError: not available.
+        InputError: no such preset.
     """
-    if name == "official":
-        raise InputError(
-            "the official preset is not available in this version", hint="use --preset open"
-        )
-    if name != "open":
-        raise InputError(f"there is no preset {name!r}", hint="use --preset open")
+    if name not in PRESETS:
+        raise InputError(f"there is no preset {name!r}", hint="use " + " or ".join(PRESETS))
     return name
 
 
-def read_avatar(pipeline: Pipeline, path: Path, face: int | None) -> Avatar:
-    """An avatar from an avatar file, or from a portrait by encoding it.
+def read_avatar(pipeline: Preset[Any], path: Path, face: int | None) -> Any:
+    """An avatar of the pipeline's preset, from an avatar file or by encoding a portrait.
 
     Raises:
-        CVTHeadError: the file cannot be read, or shows no usable face.
+        CVTHeadError: the file cannot be read or is of another preset, or it shows no usable face.
     """
-    if path.suffix.lower() == ".avatar":
-        return Avatar.load(path)
-    return pipeline.encode(read_image(path), face=face)
+    if path.suffix.lower() != ".avatar":
+        return pipeline.encode(read_image(path), face=face)
+    avatar = load_avatar(path)
+    if avatar.preset != pipeline.preset:
+        raise InputError(
+            f"{path} is of the preset {avatar.preset}", hint=f"use --preset {avatar.preset}"
+        )
+    return avatar
+
+
+def load_avatar(path: Path) -> Avatar | OfficialAvatar:
+    """An avatar file of either preset.
+
+    Raises:
+        AvatarFileError: as Avatar.load.
+    """
+    return OfficialAvatar.load(path) if is_official(path) else Avatar.load(path)

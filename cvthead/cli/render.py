@@ -8,7 +8,6 @@ from typing import Any, get_args
 
 import numpy as np
 
-from cvthead.avatar import Avatar
 from cvthead.cli.motion_file import vector_controls
 from cvthead.cli.picture import (
     IMAGE_FORMATS,
@@ -17,11 +16,12 @@ from cvthead.cli.picture import (
     check_size,
     write_picture,
 )
+from cvthead.cli.portrait import load_avatar
 from cvthead.cli.values import vector, weights
 from cvthead.coefficients import Coefficients
 from cvthead.composite import Composer
 from cvthead.controls import FIELDS, Controls, Mode
-from cvthead.pipeline import Pipeline
+from cvthead.preset import load_preset
 
 FORMS = """\
 Coefficients are written as all numbers (--jaw 0.3,0,0), as single ones (--expression
@@ -70,9 +70,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 def run(args: argparse.Namespace) -> None:
     check_output(args.output, tuple(IMAGE_FORMATS), alpha=args.background == "transparent")
     check_size(args.size)
-    avatar = Avatar.load(args.avatar)
+    avatar = load_avatar(args.avatar)
     controls = controls_of(args, avatar.coefficients)
-    pipeline = Pipeline.load(avatar.preset)
+    pipeline = load_preset(avatar.preset)
     composer = Composer.of(args.background, args.size, pipeline.background(avatar))
     frame = pipeline.render(avatar, controls)
     write_picture(args.output, composer.picture(frame), composer.source)

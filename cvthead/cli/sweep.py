@@ -6,12 +6,12 @@ import argparse
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from cvthead.avatar import Avatar
 from cvthead.camera import CROP_PIXELS, Camera
 from cvthead.cli.picture import IMAGE_FORMATS, check_output, write_picture
 from cvthead.cli.portrait import add_portrait_options, read_avatar
@@ -20,7 +20,7 @@ from cvthead.composite import resampled
 from cvthead.controls import Controls, resolve
 from cvthead.crop import head_crop
 from cvthead.errors import InputError
-from cvthead.pipeline import Pipeline
+from cvthead.preset import AnyAvatar, Preset, load_preset
 from cvthead.provenance import SourceType
 
 MARGIN, CAPTION, TITLE = 8, 22, 128  # pixels; TITLE is the column of row names
@@ -102,13 +102,13 @@ def run(args: argparse.Namespace) -> None:
     check_output(args.output, tuple(IMAGE_FORMATS), alpha=False)
     if not 32 <= args.cell <= CROP_PIXELS:
         raise InputError(f"--cell {args.cell} is out of range", hint=f"use 32 to {CROP_PIXELS}")
-    pipeline = Pipeline.load(args.preset)
+    pipeline = load_preset(args.preset)
     avatar = read_avatar(pipeline, args.portrait, args.face)
     write_picture(args.output, grid(pipeline, avatar, args.cell), SourceType.GENERATED)
     print(args.output)
 
 
-def grid(pipeline: Pipeline, avatar: Avatar, cell: int) -> NDArray[np.uint8]:
+def grid(pipeline: Preset[Any], avatar: AnyAvatar, cell: int) -> NDArray[np.uint8]:
     """The labelled grid of ROWS on white, cells of ``cell`` pixels."""
     columns = max(len(row.values) for row in ROWS)
     step = cell + CAPTION + MARGIN
@@ -128,7 +128,7 @@ def grid(pipeline: Pipeline, avatar: Avatar, cell: int) -> NDArray[np.uint8]:
     return np.array(sheet)
 
 
-def _picture(pipeline: Pipeline, avatar: Avatar, row: Row, value: float) -> NDArray[np.uint8]:
+def _picture(pipeline: Preset[Any], avatar: AnyAvatar, row: Row, value: float) -> NDArray[np.uint8]:
     coefficients, camera = resolve(
         avatar.coefficients, avatar.camera, row.controls(value), pipeline.arkit
     )
@@ -137,6 +137,6 @@ def _picture(pipeline: Pipeline, avatar: Avatar, row: Row, value: float) -> NDAr
     return pipeline.render_coefficients(avatar, coefficients, camera).over(WHITE)
 
 
-def _centred(pipeline: Pipeline, coefficients: Coefficients, camera: Camera) -> Camera:
+def _centred(pipeline: Preset[Any], coefficients: Coefficients, camera: Camera) -> Camera:
     """The camera moved so that the face lies where it lies in every source crop."""
     return camera.in_crop(head_crop(pipeline.head, coefficients, camera))

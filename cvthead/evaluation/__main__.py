@@ -18,6 +18,7 @@ from cvthead.evaluation.protocol import Animate, Clip, Draw, Drawn, Evaluator, I
 from cvthead.evaluation.report import Report
 from cvthead.evaluation.sweep import sweep
 from cvthead.pipeline import Pipeline
+from cvthead.runtime.threads import one_thread_per_call
 from cvthead.source import HeadCrop
 
 
@@ -38,6 +39,7 @@ def animate_with(pipeline: Pipeline) -> Animate:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the evaluation; returns the exit code."""
+    one_thread_per_call()
     options = parser().parse_args(arguments)
     paths = sorted((options.data / "clips" / "val").glob("*.mp4"))[:: options.every]
     if not paths:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from cvthead.camera import Camera
 from cvthead.coefficients import Coefficients
 from cvthead.deformation import Deformation, DeformationModel
+from cvthead.driving import at_neck
 from cvthead.errors import FaceError
 from cvthead.evaluation.baselines import ColouredMesh
 from cvthead.evaluation.metrics import Metrics, Picture, Score, on_white
@@ -143,7 +144,8 @@ class Evaluator:
         source: TrackedFace,
     ) -> Reenactment:
         target = cut_head(self.tracker, image, driver)
-        drawn = {name: draw(target.coefficients, target.camera) for name, draw in draws.items()}
+        posed = at_neck(self.tracker.head, source.coefficients, target.coefficients, target.camera)
+        drawn = {name: draw(*posed) for name, draw in draws.items()}
         wanted = on_white(target.image, target.mask)
         pictures = [on_white(result.rgb, target.mask) for result in drawn.values()]
         mattes = [on_white(result.rgb, result.alpha) for result in drawn.values()]

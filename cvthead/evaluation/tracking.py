@@ -7,8 +7,6 @@ and the share of lost video frames. Data: ``stills/val`` and ``clips/val`` below
 from __future__ import annotations
 
 import argparse
-import os
-import sys
 import time
 import warnings
 from collections.abc import Iterator, Sequence
@@ -20,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvthead.errors import FaceError
+from cvthead.runtime.threads import one_thread_per_call
 from cvthead.tracking.tracker import FaceTurnedWarning, TrackedFace, Tracker
 
 YAW_BINS = ((0.0, 15.0), (15.0, 30.0), (30.0, 90.0))
@@ -128,6 +127,7 @@ def clip_lines(tracker: Tracker, paths: Sequence[Path], limit: int | None) -> li
 
 
 def main() -> None:
+    one_thread_per_call()
     parser = argparse.ArgumentParser(description=__doc__)
     default = Path(__file__).resolve().parents[2].parent / "shared" / "data"
     parser.add_argument("data", nargs="?", type=Path, default=default)
@@ -147,8 +147,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    # BLAS reads its number of threads when numpy is imported, which has happened by now.
-    if os.environ.get("OPENBLAS_NUM_THREADS") != "1":
-        os.environ["OPENBLAS_NUM_THREADS"] = "1"
-        os.execv(sys.executable, [sys.executable, "-m", __spec__.name, *sys.argv[1:]])
     main()

@@ -5,6 +5,7 @@ Attribute names are those of the released weights.
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor, nn
 
 from cvthead.model.resnet import resnet50
@@ -31,5 +32,5 @@ class DecaEncoder(nn.Module):
 
 def split_codes(codes: Tensor) -> dict[str, Tensor]:
     """(..., 236) -> the CODES by name, (..., length) each."""
-    parts = codes.split(list(CODES.values()), dim=-1)
+    parts = torch.split(codes, list(CODES.values()), dim=-1)
     return dict(zip(CODES, parts, strict=True))

@@ -18,13 +18,12 @@ from cvthead.errors import AvatarFileError, CoefficientsError
 from cvthead.files import write_file
 from cvthead.model.config import PAPER
 from cvthead.official.crop import FaceSquare
-from cvthead.official.keys import released_shapes
 from cvthead.official.manifest import PRESET
 
 FORMAT = "cvthead-official-avatar"
 VERSION = "1"
 MAX_BYTES = 4 * 2**20
-VERTICES = released_shapes()["deform_mean"][0]
+VERTICES = 5023  # of FLAME
 ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
     "descriptors": ("F32", (VERTICES, PAPER.descriptor_size)),
     "offsets": ("F32", (VERTICES, 3)),
@@ -122,6 +121,15 @@ class OfficialAvatar:
             raise AvatarFileError(
                 f"{path} is damaged or not an avatar of the official preset: {error}", hint=hint
             ) from error
+
+
+def is_official(path: Path) -> bool:
+    """Whether a file is an avatar of this preset; False also for one that cannot be read."""
+    try:
+        with safe_open(str(path), framework="np") as file:
+            return (file.metadata() or {}).get("format") == FORMAT
+    except (SafetensorError, OSError):
+        return False
 
 
 def _array(file: Any, name: str) -> NDArray[Any]:

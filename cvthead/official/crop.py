@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from cvthead.camera import CROP_PIXELS, Camera
 
@@ -89,14 +88,7 @@ class FaceSquare:
         return self.zoom * CROP_PIXELS / DECA_PIXELS
 
 
-def resized(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(H, W, 3) -> (256, 256, 3), as the released code does it (bicubic, aspect not kept)."""
-    if image.shape[:2] == (CROP_PIXELS, CROP_PIXELS):
-        return image
-    return np.array(Image.fromarray(image).resize((CROP_PIXELS, CROP_PIXELS)))
-
-
 def _bilinear(positions: NDArray[np.float64], count: int) -> NDArray[np.float64]:
     """(n, count) weights of the pixels around each position; pixels outside count as 0."""
     distance = np.abs(positions[:, None] - np.arange(count))
-    return np.maximum(1 - distance, 0)
+    return np.asarray(np.maximum(1 - distance, 0), dtype=np.float64)

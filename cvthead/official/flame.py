@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 
 from cvthead.coefficients import EXPRESSION_SIZE, POSE_SIZE, SHAPE_SIZE
 from cvthead.errors import AssetError
-from cvthead.head.model import PARENTS, POSE_FEATURES, HeadModel
+from cvthead.head.model import PARENTS, POSE_FEATURES, HeadModel, Region
 from cvthead.official.keys import part
 from cvthead.official.unpickle import HINT, load_npy, load_pickle
 
 PREFIX = "deca.flame."
 EXPRESSION_START = 300  # columns of shapedirs before it are shape
 LANDMARKS = 68
+FOREHEAD = 0.4  # height above the brows, as a share of that between chin and brows
 # The released landmark file keeps the contour's tables as PyTorch tensors; nothing needs them.
 UNUSED_TENSORS = frozenset({"torch._utils._rebuild_tensor_v2", "torch.storage._load_from_bytes"})
 
@@ -76,7 +77,7 @@ class Flame:
                 raise AssetError(f"FLAME: {field.name} holds NaN or infinity", hint=HINT)
 
     def head(self) -> HeadModel:
-        """As a head model without the parts that only the open head has."""
+        """As a head model without landmarks of the 478 and other parts of the open head alone."""
         none = np.zeros((0, 3), np.float32)
         return HeadModel(
             template=self.template,
@@ -88,7 +89,7 @@ class Flame:
             faces=self.faces,
             uv=none[:, :2],
             uv_faces=none.astype(np.int32),
-            region=none[:, 0].astype(np.uint8),
+            region=self._regions(),
             landmark_faces=none[:, 0].astype(np.int32),
             landmark_bary=none,
             landmark_sigma=none[:, 0],
@@ -96,6 +97,18 @@ class Flame:
             shape_parity=none[:, 0].astype(np.int8),
             expression_parity=none[:, 0].astype(np.int8),
         )
+
+    def _regions(self) -> NDArray[np.uint8]:
+        """(5023,) FACE between chin and hairline and in front of the ears, SCALP elsewhere.
+
+        FLAME does not name its regions; crops are centred on the face.
+        """
+        landmarks = self.landmarks(self.template)
+        low, high = landmarks.min(axis=0), landmarks.max(axis=0)
+        high[1] += FOREHEAD * (high[1] - low[1])
+        high[2] = np.inf
+        face = ((self.template >= low) & (self.template <= high)).all(axis=1)
+        return np.where(face, Region.FACE, Region.SCALP).astype(np.uint8)
 
     def landmarks(self, vertices: Array) -> Array:
         """(68, 3) landmarks on ``vertices`` (5023, 3)."""

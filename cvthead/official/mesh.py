@@ -45,7 +45,7 @@ def spirals(points: NDArray[np.float64], faces: Ints) -> Ints:
 
     A part of fewer vertices is filled up with the nearest others.
     """
-    mesh = HalfedgeMesh(len(points), (tuple(face) for face in faces.tolist()))  # type: ignore[arg-type]
+    mesh = HalfedgeMesh(len(points), (tuple(face) for face in faces.tolist()))
     rings = [mesh.ring(vertex) for vertex in range(len(points))]
     table = np.empty((len(points), SPIRAL_LENGTH), np.int32)
     for vertex, first in enumerate(rings):
@@ -93,7 +93,7 @@ def _selection(matrix: csc_matrix, counts: tuple[int, ...]) -> Ints:
     rows = matrix.tocsr()
     if rows.shape != (coarse, fine) or rows.nnz != coarse or (rows.data != 1).any():
         raise ValueError("down_transform does not select one vertex a row")
-    return rows.indices.astype(np.int32)  # type: ignore[no-any-return]
+    return np.asarray(rows.indices, dtype=np.int32)
 
 
 def _weights(matrix: csc_matrix, counts: tuple[int, ...]) -> tuple[Ints, Array]:

@@ -20,19 +20,17 @@ from torch import Tensor
 from cvthead.camera import CROP_PIXELS, Camera
 from cvthead.coefficients import Coefficients
 from cvthead.controls import Controls, resolve
-from cvthead.crop import head_crop
 from cvthead.errors import ModelChangedError
 from cvthead.frame import Frame
 from cvthead.head.arkit import ArkitMap
 from cvthead.head.model import HeadModel
-from cvthead.model.deca import split_codes
 from cvthead.model.paper import over_white
 from cvthead.official.arkit import fit_arkit
 from cvthead.official.avatar import OfficialAvatar
 from cvthead.official.crop import FaceSquare
 from cvthead.official.manifest import PRESET, default_folder
 from cvthead.official.networks import OfficialNetworks, picture_tensor
-from cvthead.tracking.landmarks68 import landmarks68
+from cvthead.official.tracker import OfficialTracker, Picture
 from cvthead.tracking.tracker import TrackedFace, Tracker
 
 Array = NDArray[np.float32]
@@ -40,14 +38,6 @@ Image = NDArray[np.uint8]
 
 INPAINT_MARGIN = 9
 SMALL = CROP_PIXELS // 4
-
-
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """What one DECA pass says of a face: FLAME coefficients and its raw camera."""
-
-    coefficients: Coefficients
-    cam: Array
 
 
 class Driven(NamedTuple):
@@ -72,7 +62,7 @@ class OfficialPipeline:
     networks: OfficialNetworks
     head: HeadModel
     arkit: ArkitMap
-    tracker: Tracker
+    tracker: OfficialTracker
 
     @classmethod
     def load(cls, folder: Path | None = None) -> OfficialPipeline:
@@ -85,9 +75,11 @@ class OfficialPipeline:
             AssetError: nothing was imported there, or it is damaged.
         """
         networks = OfficialNetworks.load(folder or default_folder())
-        tracker = Tracker.load()
-        arkit = fit_arkit(networks.flame, tracker.head, ArkitMap.load())
-        return cls(networks, networks.flame.head(), arkit, tracker)
+        finder, flame = Tracker.load(), networks.flame
+        head = flame.head()
+        arkit = fit_arkit(flame, finder.head, ArkitMap.load())
+        tracker = OfficialTracker(head, finder, networks.deca, flame.rest_pose)
+        return cls(networks, head, arkit, tracker)
 
     @property
     def preset(self) -> str:
@@ -119,25 +111,22 @@ class OfficialPipeline:
         Raises:
             ImageError, FaceError: as :meth:`cvthead.tracking.tracker.Tracker.track`.
         """
-        tracked = self.tracker.track(image, face=face, only_one=only_one)
-        return self.encode_picture(*self._cut(image, tracked), deform=deform)
+        picture = self.tracker.picture(image, face=face, only_one=only_one)
+        return self.encode_picture(picture, deform=deform)
 
     @torch.inference_mode()
-    def encode_picture(
-        self, picture: Image, landmarks: NDArray[np.floating], *, deform: bool = True
-    ) -> OfficialAvatar:
+    def encode_picture(self, picture: Picture, *, deform: bool = True) -> OfficialAvatar:
         """Turn a 256 x 256 picture into an avatar, as the released code does.
 
         Args:
-            picture: (256, 256, 3) uint8 RGB, whole head in view.
-            landmarks: (68, 2) in its pixels, the first pixel's centre at 0.
+            picture: with the whole head in view.
             deform: False leaves out hair and shoulders.
         """
         networks = self.networks
-        image = picture_tensor(picture)
+        image = picture_tensor(picture.pixels)
         mask = networks.parsing.mask(image)
-        square = FaceSquare.around(landmarks)
-        estimate = self.estimate(picture, square)
+        square = picture.square
+        estimate = self.tracker.estimate(picture.pixels, square)
         offsets = networks.hair(image)[0].numpy() if deform else np.zeros_like(self.head.template)
         camera = square.camera(estimate.cam)
         points = self._project(estimate.coefficients, camera, offsets, square)
@@ -149,24 +138,9 @@ class OfficialPipeline:
             estimate.coefficients,
             camera,
             square,
-            without_person(picture, mask[0, 0].numpy() > 0),
+            without_person(picture.pixels, mask[0, 0].numpy() > 0),
             self.fingerprint,
         )
-
-    @torch.inference_mode()
-    def estimate(self, picture: Image, square: FaceSquare) -> Estimate:
-        """One DECA pass: coefficients of the face in ``square`` of a 256 x 256 picture."""
-        crop = torch.from_numpy(square.cut(picture))[None]
-        codes = {k: v.numpy() for k, v in split_codes(self.networks.deca(crop)[0]).items()}
-        return Estimate(
-            Coefficients(codes["shape"], codes["exp"], self.full_pose(codes["pose"])), codes["cam"]
-        )
-
-    def full_pose(self, pose: NDArray[np.floating]) -> Array:
-        """DECA's six (global and jaw rotation) -> (15,); neck and eyes as FLAME rests."""
-        full = self.networks.flame.rest_pose.copy()
-        full[:3], full[6:9] = pose[:3], pose[3:]
-        return full
 
     def drive(
         self,
@@ -182,32 +156,28 @@ class OfficialPipeline:
             avatar: whose shape is kept.
             image: (H, W, 3) uint8 RGB.
             cross_identity: as :meth:`drive_picture`.
-            previous: the same face in the driving frame before.
+            previous: the same face in the driving frame before, as ``tracker.finder`` found it.
 
         Raises:
             ImageError, FaceError: as :meth:`cvthead.tracking.tracker.Tracker.track`.
         """
-        picture, landmarks = self._cut(image, self.tracker.track(image, previous=previous))
-        return self.drive_picture(avatar, picture, landmarks, cross_identity=cross_identity)
+        picture = self.tracker.picture(image, previous=previous)
+        return self.drive_picture(avatar, picture, cross_identity=cross_identity)
 
     def drive_picture(
-        self,
-        avatar: OfficialAvatar,
-        picture: Image,
-        landmarks: NDArray[np.floating],
-        *,
-        cross_identity: bool = True,
+        self, avatar: OfficialAvatar, picture: Picture, *, cross_identity: bool = True
     ) -> Driven:
-        """As :meth:`drive`, of a 256 x 256 picture and its landmarks.
+        """As :meth:`drive`, of a 256 x 256 picture.
 
         Args:
-            avatar, picture, landmarks: as :meth:`encode_picture`.
+            avatar: whose shape is kept.
+            picture: of the driver.
             cross_identity: True places the driver's DECA camera in the avatar's face square, so
                 that the head stays where the portrait has it; False places the head where the
                 driving picture has it (the released code's ``is_cross_id``).
         """
-        square = FaceSquare.around(landmarks)
-        driver = self.estimate(picture, square)
+        square = picture.square
+        driver = self.tracker.estimate(picture.pixels, square)
         coefficients = replace(driver.coefficients, shape=avatar.coefficients.shape)
         placed = avatar.square if cross_identity else square
         return Driven(coefficients, placed.camera(driver.cam), placed)
@@ -303,14 +273,6 @@ class OfficialPipeline:
         points = camera.project(self.head.vertices(coefficients) + offsets)
         points[:, 2] *= np.float32(square.depth_ratio)
         return points
-
-    def _cut(self, image: Image, tracked: TrackedFace) -> tuple[Image, NDArray[np.float64]]:
-        """The square around a tracked head, and the 68 landmarks in its pixels."""
-        crop = head_crop(self.tracker.head, tracked.coefficients, tracked.camera)
-        picture, _ = crop.cut(image)
-        landmarks = landmarks68(tracked.landmarks)[:, :2] - (crop.left, crop.top)
-        # The tracker counts the first pixel's centre as 0.5, the released code as 0.
-        return picture, landmarks * (CROP_PIXELS / crop.size) - 0.5
 
 
 def without_person(picture: Image, person: NDArray[np.bool_]) -> Image:

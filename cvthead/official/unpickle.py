@@ -87,7 +87,7 @@ class SparseRecord(Record):
     def matrix(self) -> csc_matrix:
         if not isinstance(self.state, dict):
             raise ValueError("a sparse matrix without contents")
-        shape = self.state.get("_shape", self.state.get("shape"))
+        shape = self.state["_shape"]
         parts = tuple(_plain(self.state[name]) for name in ("data", "indices", "indptr"))
         result = self.kind(parts, shape=tuple(int(n) for n in shape))
         result.check_format(full_check=True)

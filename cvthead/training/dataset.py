@@ -19,6 +19,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from cvthead.deformation import MAX_SHELL_POINTS
+from cvthead.driving import at_neck
 from cvthead.head.model import HeadModel
 from cvthead.points import FAR_AWAY, PointLayout
 from cvthead.source import driven_points, network_input
@@ -85,7 +86,8 @@ class PairDataset(Dataset[dict[str, Tensor]]):
 
         def points(frame: Frame) -> Array:
             posed = replace(frame.coefficients, shape=source.coefficients.shape)
-            return driven_points(self.head, self.layout, posed, deformation, frame.camera)
+            posed, camera = at_neck(self.head, source.coefficients, posed, frame.camera)
+            return driven_points(self.head, self.layout, posed, deformation, camera)
 
         own = points(source)
         if record.frames > 1:

@@ -88,7 +88,9 @@ async def driven(
     timings = {"track": (time.perf_counter() - begin) * 1000}
     crop = _crop(service, reference or face) if options.camera == "driver" else None
     start = None if options.relative is False else reference
-    pose = await asyncio.to_thread(drive, avatar, face, reference=start, crop=crop)
+    pose = await asyncio.to_thread(
+        drive, service.engine.pipeline.head, avatar, face, reference=start, crop=crop
+    )
     return await send_frame(request, service, avatar, pose, output, timings)
 
 
