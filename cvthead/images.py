@@ -59,7 +59,7 @@ def read_image(path: Path | str) -> NDArray[np.uint8]:
     return decode_image(data)
 
 
-def decode_image(data: bytes) -> NDArray[np.uint8]:
+def decode_image(data: bytes, *, longest: int | None = None) -> NDArray[np.uint8]:
     """Decode a PNG, JPEG or WebP file.
 
     The type and the size are taken from the header and checked before any pixel is decoded. The
@@ -69,6 +69,8 @@ def decode_image(data: bytes) -> NDArray[np.uint8]:
 
     Args:
         data: the whole file, at most ``MAX_BYTES``.
+        longest: shrink the picture to this longer side. A JPEG is then decoded at a half, a
+            quarter or an eighth where that suffices, in a fraction of the time.
 
     Returns:
         (H, W, 3) uint8 RGB; both sides ``MIN_SIDE`` to ``MAX_SIDE``, at most ``MAX_PIXELS``.
@@ -98,8 +100,12 @@ def decode_image(data: bytes) -> NDArray[np.uint8]:
                 image.verify()  # checksums, which decoding alone ignores
         with _opened(kind, data) as image:
             _check_size(*image.size)
+            if longest is not None and kind == "jpeg":
+                zoom = longest / max(image.size)
+                image.draft("RGB", (round(image.width * zoom), round(image.height * zoom)))
             image.load()
-            return _rgb(image)
+            pixels = _rgb(image)
+        return pixels if longest is None else shrink(pixels, longest)
     except DAMAGE as error:
         raise ImageError(
             f"the {kind.upper()} file is truncated or damaged ({error})",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from importlib import resources
 from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
@@ -13,11 +12,6 @@ from torch import Tensor, nn
 from cvthead.errors import AssetError
 
 FINGERPRINT_DIGITS = 16
-
-
-def packaged_weights(preset: str) -> Path:
-    """Path of the weights that ship with the package."""
-    return Path(str(resources.files("cvthead").joinpath("assets", f"{preset}.safetensors")))
 
 
 def fingerprint(tensors: dict[str, Tensor]) -> str:

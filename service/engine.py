@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -158,7 +159,7 @@ class Engine:
         """The same for driving frames."""
         self._rendering.check()
 
-    async def decode(self, data: bytes) -> NDArray[np.uint8]:
+    async def decode(self, data: bytes, *, longest: int | None = None) -> NDArray[np.uint8]:
         """``cvthead.images.decode_image`` in a thread, few at a time.
 
         Raises:
@@ -170,7 +171,8 @@ class Engine:
         self._decoding += 1
         try:
             loop = asyncio.get_running_loop()
-            return await loop.run_in_executor(self._decoders, decode_image, data)
+            decoding = partial(decode_image, data, longest=longest)
+            return await loop.run_in_executor(self._decoders, decoding)
         finally:
             self._decoding -= 1
 

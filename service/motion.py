@@ -14,13 +14,12 @@ from cvthead.coefficients import JOINTS, Coefficients
 from cvthead.controls import Controls, resolve
 from cvthead.crop import head_crop
 from cvthead.driving import drive
-from cvthead.images import shrink
 from cvthead.tracking.one_euro import FaceFilter
 from cvthead.tracking.tracker import TrackedFace
 from service.engine import Engine
 
 # The face networks look at 256 pixels; more only takes time.
-LONGEST_SIDE = 1280
+LONGEST_SIDE = 960
 # Assumed between two frames whose capture times do not increase.
 FRAME_SECONDS = 1 / 30
 
@@ -61,7 +60,7 @@ class Motion:
         return drive(head, self._avatar, face, reference=reference, crop=self._crop)
 
     async def _face(self, message: Message) -> TrackedFace:
-        image = shrink(await self._engine.decode(message.payload), LONGEST_SIDE)
+        image = await self._engine.decode(message.payload, longest=LONGEST_SIDE)
         face = self._previous = await self._engine.track(image, self._previous)
         if not self._hello.smooth:
             return face

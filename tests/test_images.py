@@ -9,6 +9,7 @@ from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -246,6 +247,19 @@ def test_transparency_without_alpha_channel(mode: str) -> None:
     else:
         data = saved(image, "PNG", transparency=(0, 0, 0) if mode == "RGB" else 0)
     assert (decode_image(data) == 255).all()
+
+
+def test_jpeg_decoded_at_a_fraction_is_the_shrunk_picture() -> None:
+    line = np.linspace(0, 255, 1600)
+    picture = np.dstack([np.broadcast_to(line, (1200, 1600))] * 3).astype(np.uint8)
+    data = encode_image(picture, "jpeg")
+    for longest, shape in ((800, (600, 800, 3)), (500, (375, 500, 3)), (4000, picture.shape)):
+        small = decode_image(data, longest=longest)
+        assert small.shape == shape
+        expected = cv2.resize(picture, shape[1::-1], interpolation=cv2.INTER_AREA)
+        assert np.abs(small.astype(int) - expected).max() <= 6
+    png = decode_image(encode_image(picture), longest=800)
+    assert png.shape == (600, 800, 3)
 
 
 def test_cmyk_jpeg() -> None:
