@@ -25,6 +25,8 @@ class Driven(Protocol):
     def coefficients(self) -> Coefficients: ...
     @property
     def camera(self) -> Camera: ...
+    @property
+    def preset(self) -> str: ...
 
 
 def drive(
@@ -37,7 +39,8 @@ def drive(
 ) -> tuple[Coefficients, Camera]:
     """Expression and pose of the driver on the avatar's identity (paper equation 2).
 
-    The head turns at the neck; the shoulders stay as in the portrait, see :func:`at_neck`.
+    In the open preset the head turns at the neck and the shoulders stay as in the portrait, see
+    :func:`at_neck`; in the official one the body turns along, as in the released code.
 
     Args:
         head: the head model of both.
@@ -60,6 +63,8 @@ def drive(
         if crop is not None:
             camera = _moved(avatar.camera, reference.camera.in_crop(crop), camera)
     wanted = replace(source, expression=expression, pose=pose)
+    if avatar.preset == "official":
+        return wanted, camera
     if crop is None:
         return _turned(source, wanted), camera
     return at_neck(head, source, wanted, camera)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
 
 from cvthead.camera import Camera
 from cvthead.coefficients import Coefficients
-from cvthead.driving import at_neck
+from cvthead.driving import at_neck, drive
 from cvthead.head.model import HeadModel, Region
+from cvthead.tracking.tracker import TrackedFace
 
 CAMERA = Camera(5.5, 0.01, 0.02)
 
@@ -46,6 +49,17 @@ def test_the_face_stays_and_the_shoulders_stand(
         turn(wanted.joint("global")) @ turn(wanted.joint("neck")),
         atol=1e-6,
     )
+
+
+def test_the_body_turns_along_in_the_official_preset(head: HeadModel) -> None:
+    source = Coefficients.zeros()
+    driver = source.with_joints({"global": (0, 0.4, 0)})
+    face = TrackedFace(driver, CAMERA, np.zeros((478, 3), np.float32), 1.0, (0, 0, 1, 1), 1.0)
+    for preset, joint in (("official", "global"), ("open", "neck")):
+        avatar = SimpleNamespace(coefficients=source, camera=CAMERA, preset=preset)
+        coefficients, camera = drive(head, avatar, face)
+        assert np.allclose(coefficients.joint(joint), (0, 0.4, 0), atol=1e-6)
+        assert camera == CAMERA
 
 
 def test_the_source_itself_is_not_moved(head: HeadModel) -> None:
