@@ -19,7 +19,7 @@ Z_BUFFER_PIXELS = 72
 DEPTH_TOLERANCE = 0.012
 GRAZING = 0.1
 MASK_LEVEL = 0.5
-MARGIN = 3.0  # pixels
+MARGIN = 1.0  # pixels
 
 
 def visible_points(

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
@@ -15,21 +16,30 @@ from numpy.typing import NDArray
 from cvthead.camera import CROP_PIXELS
 from cvthead.deformation import MAX_SHELL_POINTS
 from cvthead.runtime.model_folder import DESCRIBE, PAINT, ModelFolder
-from cvthead.runtime.splat import splat
+from cvthead.runtime.splat import EMPTY_DEPTH, splat
 from cvthead.runtime.warp import dense_flow, warp
 from cvthead.source import Source
 
 Array = NDArray[np.float32]
 
 MAX_THREADS = 4  # more bring nothing at this size
+CLOSING = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9))  # closes gaps between points
+SOFT_EDGE = np.ones((3, 3), np.uint8)
 PLACE_SIZE = 3  # a descriptor row's last values: x and y in the portrait, seen
 
 
 class PaintInput(NamedTuple):
-    """What the frame network reads: splat (s, s, 1 + C + 1) and warped (256, 256, 4) uint8."""
+    """What the frame network reads, and how far its result may reach.
+
+    Attributes:
+        splat: (s, s, 1 + C + 1).
+        warped: (256, 256, 4) uint8.
+        reach: (256, 256) uint8, highest alpha; see :func:`reach_of`.
+    """
 
     splat: Array
     warped: NDArray[np.uint8]
+    reach: NDArray[np.uint8]
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +105,8 @@ class Networks:
             "warped": np.stack([one.warped for one in inputs]),
         }
         out: NDArray[np.uint8] = self.paint_session.run(None, feed)[0]
+        for rgba, one in zip(out, inputs, strict=True):
+            np.minimum(rgba[..., 3], one.reach, out=rgba[..., 3])
         return out
 
 
@@ -113,7 +125,21 @@ def place(points: Array, rows: Array, portrait: NDArray[np.uint8], size: int) ->
     seen = np.ascontiguousarray(image[..., -1])
     flow = dense_flow(image[..., -PLACE_SIZE:-1], seen, CROP_PIXELS)
     kept = np.concatenate([image[..., :-PLACE_SIZE], image[..., -1:]], axis=-1)
-    return PaintInput(kept, warp(portrait, flow))
+    warped = warp(portrait, flow)
+    return PaintInput(kept, warped, reach_of(image[..., 0], warped))
+
+
+def reach_of(depth: Array, warped: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(256, 256) uint8: 255 where points lie or the carried portrait shows the person.
+
+    Beyond the edge of a portrait nothing is known. Training pictures end there as well, so the
+    network was never told to leave it empty.
+    """
+    drawn = (depth > EMPTY_DEPTH).astype(np.uint8) * 255
+    closed = cv2.morphologyEx(drawn, cv2.MORPH_CLOSE, CLOSING)
+    size = warped.shape[0]
+    points = cv2.resize(closed, (size, size), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(np.maximum(points, cv2.dilate(warped[..., 3], SOFT_EDGE)), np.uint8)
 
 
 def _open(data: bytes, threads: int) -> ort.InferenceSession:

@@ -72,8 +72,8 @@ def frame_inputs(describe: Path, records: Path, count: int) -> list[Feed]:
         inputs = {name: sample[name][None] for name in DESCRIBE_INPUTS}
         rows = session.run(None, inputs)[0][0]
         portrait = portrait_pixels(sample["source"])
-        splat, warped = place(sample["driven"][0], rows, portrait, SPLAT_SIZE)
-        feeds.append({"splat": splat[None], "warped": warped[None]})
+        placed = place(sample["driven"][0], rows, portrait, SPLAT_SIZE)
+        feeds.append({"splat": placed.splat[None], "warped": placed.warped[None]})
     return feeds
 
 
