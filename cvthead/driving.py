@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import cv2
@@ -27,6 +27,15 @@ class Driven(Protocol):
     def camera(self) -> Camera: ...
     @property
     def preset(self) -> str: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Portrait:
+    """What a client without the avatar's file knows of an avatar."""
+
+    coefficients: Coefficients
+    camera: Camera
+    preset: str
 
 
 def drive(

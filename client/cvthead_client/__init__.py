@@ -28,6 +28,8 @@ from cvthead_client.types import (
 )
 from cvthead_client.wire import CoefficientFrame, Stats
 
+__version__ = "0.1.0"
+
 __all__ = [
     "AsyncClient",
     "AsyncStream",

@@ -8,10 +8,10 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
+from cvthead_client import __version__
 from cvthead_client.client import Client
 from cvthead_client.errors import CVTHeadClientError
 from cvthead_client.hello import Hello, Mode, StreamOutput
@@ -39,7 +39,7 @@ def parser() -> argparse.ArgumentParser:
         description="Animate a portrait with a camera or a video, over a cvthead service. Animate "
         "only people who agreed.",
     )
-    result.add_argument("--version", action="version", version=version("cvthead-client"))
+    result.add_argument("--version", action="version", version=__version__)
     result.add_argument(
         "source",
         metavar="VIDEO|CAMERA",
@@ -118,7 +118,10 @@ def _run(args: argparse.Namespace) -> None:
     if as_numbers and not driver.can_track():
         raise driver.not_installed()
     mode: Mode = "relative" if args.relative else "absolute"
-    hello = Hello(StreamOutput("jpeg", args.size, args.background, quality=90), mode, args.camera)
+    # Numbers are those of the frame that is wanted; relative motion is worked out here.
+    wire_mode: Mode = "absolute" if as_numbers else mode
+    output = StreamOutput("jpeg", args.size, args.background, quality=90)
+    hello = Hello(output, wire_mode, args.camera)
     is_file = Path(args.source).is_file()
     frames = media.read_video(Path(args.source)) if is_file else media.read_camera(args.source)
     key = args.key or os.environ.get("CVTHEAD_KEY")
@@ -129,9 +132,8 @@ def _run(args: argparse.Namespace) -> None:
     ):
         if as_numbers:
             print("tracking here; only numbers are sent", file=sys.stderr)
-            source = avatar.source if args.camera == "driver" else None
-            camera = None if source is None else source.camera
-            send: Send = driver.coefficient_sender(stream, mode, camera)
+            follow = args.camera == "driver"
+            send: Send = driver.coefficient_sender(stream, avatar, mode, follow=follow)
         else:
             print(f"sending pictures of the driver to {args.server}", file=sys.stderr)
             send = driver.picture_sender(stream)

@@ -9,12 +9,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cvthead_client.errors import CVTHeadClientError
 from cvthead_client.media import Captured, jpeg_of
 from cvthead_client.stream import Stream
-from cvthead_client.types import Camera
+from cvthead_client.types import AvatarInfo
 from cvthead_client.wire import CoefficientFrame
 
 if TYPE_CHECKING:
@@ -46,14 +45,17 @@ def picture_sender(stream: Stream) -> Send:
 
 
 def coefficient_sender(
-    stream: Stream, mode: Literal["absolute", "relative"], camera: Camera | None
+    stream: Stream, avatar: AvatarInfo, mode: Literal["absolute", "relative"], *, follow: bool
 ) -> Send:
     """Finds the face here and sends its coefficients; no picture leaves this machine.
 
     Args:
-        camera: the portrait's, to follow place and size of the driver's head; None keeps it.
+        stream: in the mode "absolute": relative motion is worked out here.
+        avatar: that is driven, with its source coefficients (not from a list).
+        mode: "relative" adds the motion since the first frame to the portrait.
+        follow: whether place and size of the driver's head are followed too.
     """
-    track = LocalTracker(mode, camera)
+    track = LocalTracker(avatar, mode, follow=follow)
 
     def send(frame: Captured) -> int | None:
         coefficients = track.step(frame)
@@ -65,14 +67,36 @@ def coefficient_sender(
 
 
 class LocalTracker:
-    """Follows one face and gives what the stream's COEFFICIENTS hold."""
+    """Follows one face and gives what the stream's COEFFICIENTS hold, computed as the service
+    does it for pictures."""
 
-    def __init__(self, mode: Literal["absolute", "relative"], camera: Camera | None) -> None:
+    def __init__(
+        self, avatar: AvatarInfo, mode: Literal["absolute", "relative"], *, follow: bool
+    ) -> None:
+        from cvthead.camera import Camera
+        from cvthead.coefficients import Coefficients
+        from cvthead.driving import Portrait
         from cvthead.tracking.one_euro import FaceFilter
         from cvthead.tracking.tracker import Tracker
 
+        portrait = avatar.source
+        if portrait is None:
+            raise CVTHeadClientError(
+                "the avatar's coefficients are not known", hint="use Client.get(id)"
+            )
+        pose, camera = portrait.pose, portrait.camera
+        joints = (pose.global_rotation, pose.neck, pose.jaw, pose.left_eye, pose.right_eye)
+        self._portrait = Portrait(
+            Coefficients(
+                np.asarray(portrait.shape, np.float32),
+                np.asarray(portrait.expression, np.float32),
+                np.concatenate([np.asarray(joint, np.float32) for joint in joints]),
+            ),
+            Camera(camera.scale, camera.tx, camera.ty),
+            avatar.preset,
+        )
         self._mode = mode
-        self._camera = camera
+        self._follow = follow
         self._tracker = Tracker.load()
         self._filter = FaceFilter()
         self._previous: TrackedFace | None = None
@@ -80,9 +104,12 @@ class LocalTracker:
 
     def step(self, frame: Captured) -> CoefficientFrame | None:
         """The smoothed coefficients; None when no face is found."""
+        from cvthead.crop import head_crop
+        from cvthead.driving import drive
         from cvthead.errors import FaceError
         from cvthead.tracking.tracker import FaceTurnedWarning
 
+        head = self._tracker.head
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", FaceTurnedWarning)
@@ -93,31 +120,9 @@ class LocalTracker:
             face.coefficients, face.camera, frame.time
         )
         face = replace(face, coefficients=coefficients, camera=camera)
-        self._start = self._start or face
-        expression, pose = coefficients.expression, coefficients.pose
-        if self._mode == "relative":
-            expression = expression - self._start.coefficients.expression
-            pose = _turned(face, self._start)
-        return CoefficientFrame(expression, pose, self._seen_by(face, self._start))
-
-    def _seen_by(self, face: TrackedFace, start: TrackedFace) -> NDArray[np.float32] | None:
-        from cvthead.crop import head_crop
-
-        if self._camera is None:
-            return None
-        crop = head_crop(self._tracker.head, start.coefficients, start.camera)
-        now = face.camera.in_crop(crop)
-        if self._mode == "absolute":
-            return np.array([now.scale, now.tx, now.ty], np.float32)
-        first, own = start.camera.in_crop(crop), self._camera
-        moved = own.scale * now.scale / first.scale, own.tx + now.tx - first.tx
-        return np.array([*moved, own.ty + now.ty - first.ty], np.float32)
-
-
-def _turned(face: TrackedFace, start: TrackedFace) -> NDArray[np.float32]:
-    """(15,) rotations from the start's pose to the face's."""
-    from cvthead.coefficients import JOINTS
-    from cvthead.controls import composed
-
-    joints = [composed(face.coefficients.joint(j), -start.coefficients.joint(j)) for j in JOINTS]
-    return np.concatenate(joints)
+        start = self._start = self._start or face
+        crop = head_crop(head, start.coefficients, start.camera) if self._follow else None
+        reference = start if self._mode == "relative" else None
+        driven, seen = drive(head, self._portrait, face, reference=reference, crop=crop)
+        place = np.array([seen.scale, seen.tx, seen.ty], np.float32) if self._follow else None
+        return CoefficientFrame(driven.expression, driven.pose, place)
