@@ -19,6 +19,7 @@ import pytest
 from server_process import PORTRAIT, ROOT, Server, start_server
 
 from cvthead.cli.main import main
+from service.cli import listening
 
 ALICE, BOB = "alice-0123456789", "bob-9876543210-x"
 BODY_LIMIT = 1_000_000
@@ -342,3 +343,14 @@ def test_serve_tells_what_is_not_installed(tmp_path: Path) -> None:
     )
     assert process.returncode == 2
     assert process.stderr.startswith("cvthead: error: the service needs the package fastapi")
+
+
+def test_connections_send_at_once() -> None:
+    """The sockets of a server are made from this one; asyncio sets TCP_NODELAY by its protocol."""
+    with listening("127.0.0.1", 0) as bound:
+        assert bound.proto == socket.IPPROTO_TCP
+        bound.listen()
+        with socket.create_connection(bound.getsockname()):
+            accepted, _ = bound.accept()
+            with accepted:
+                assert accepted.proto == socket.IPPROTO_TCP
