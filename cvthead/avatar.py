@@ -15,20 +15,16 @@ from PIL import Image
 from PIL.ImageFile import ImageFile
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save as save_tensors
 
+from cvthead.avatar_file import opened, packed
 from cvthead.camera import CROP_PIXELS, Camera, Crop
 from cvthead.coefficients import EXPRESSION_SIZE, POSE_SIZE, SHAPE_SIZE, Coefficients
 from cvthead.deformation import MAX_SHELL_POINTS, Deformation
-from cvthead.errors import AvatarFileError, CoefficientsError
 from cvthead.files import write_file
 from cvthead.images import DAMAGE
 
 FORMAT = "cvthead-avatar"
 VERSION = "2"
-# Four times what the largest avatar needs.
-MAX_BYTES = 4 * 2**20
 CAMERA_FIELDS = ("scale", "tx", "ty")
 CROP_FIELDS = ("left", "top", "size")
 # Type (in safetensors' spelling) and shape of each array of a file. Letters stand for sizes that
@@ -114,8 +110,7 @@ class Avatar:
             "preset": self.preset,
             "fingerprint": self.fingerprint,
         }
-        contiguous = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
-        return save_tensors(contiguous, metadata=metadata)
+        return packed(tensors, metadata)
 
     def save(self, path: Path | str) -> None:
         """Write the file; an existing one is replaced only when the new one is complete.
@@ -135,21 +130,11 @@ class Avatar:
                 contents that :meth:`save` does not write.
         """
         hint = "encode the portrait again with `cvthead encode`"
-        try:
-            if Path(path).stat().st_size > MAX_BYTES:
-                raise ValueError(f"larger than {MAX_BYTES >> 20} MiB")
-            with safe_open(str(path), framework="np") as file:
-                metadata = file.metadata() or {}
-                _check_metadata(metadata)
-                _check_arrays(file)
-                arrays = {name: file.get_tensor(name) for name in ARRAYS}
-            return _avatar(arrays, metadata)
-        except FileNotFoundError as error:
-            raise AvatarFileError(f"{path} does not exist", hint=hint) from error
-        except (SafetensorError, OSError, ValueError, CoefficientsError) as error:
-            raise AvatarFileError(
-                f"{path} is damaged or not an avatar file: {error}", hint=hint
-            ) from error
+        with opened(path, "an avatar file", hint=hint) as file:
+            metadata = file.metadata() or {}
+            _check_metadata(metadata)
+            _check_arrays(file)
+            return _avatar({name: file.get_tensor(name) for name in ARRAYS}, metadata)
 
 
 def _check_metadata(metadata: dict[str, str]) -> None:

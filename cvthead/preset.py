@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from cvthead.camera import Camera
 from cvthead.coefficients import Array, Coefficients
 from cvthead.controls import Controls
+from cvthead.driving import Driven
 from cvthead.errors import AssetError
 from cvthead.frame import Frame
 from cvthead.head.arkit import ArkitMap
@@ -23,15 +24,9 @@ PRESETS = ("open", "official")
 AvatarT = TypeVar("AvatarT")
 
 
-class AnyAvatar(Protocol):
+class AnyAvatar(Driven, Protocol):
     """The part of an avatar that does not depend on the preset."""
 
-    @property
-    def coefficients(self) -> Coefficients: ...
-    @property
-    def camera(self) -> Camera: ...
-    @property
-    def preset(self) -> str: ...
     def save(self, path: Path | str) -> None: ...
 
 

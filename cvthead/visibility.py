@@ -10,8 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cvthead.deformation import to_pixels
 from cvthead.head.mesh import vertex_normals
 from cvthead.points import PointLayout
+from cvthead.silhouette import pixel_of
 
 # Coarse enough that neighbouring vertices close the surface between them.
 Z_BUFFER_PIXELS = 72
@@ -46,11 +48,8 @@ def visible_points(
 
 def inside_mask(points: NDArray[np.float32], mask: NDArray[np.float32]) -> NDArray[np.bool_]:
     """(P,) whether each projection lies in the frame and on the person."""
-    size = mask.shape[0]
-    pixel = np.floor((points[:, :2] * 0.5 + 0.5) * size).astype(np.int64)
-    inside = ((pixel >= 0) & (pixel < size)).all(axis=1)
-    x, y = np.clip(pixel, 0, size - 1).T
-    return np.asarray(inside & (mask[y, x] > MASK_LEVEL))
+    inside, column, row = _pixels(points, mask.shape[0])
+    return np.asarray(inside & (mask[row, column] > MASK_LEVEL))
 
 
 def on_person(points: NDArray[np.float32], mask: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -59,20 +58,23 @@ def on_person(points: NDArray[np.float32], mask: NDArray[np.float32]) -> NDArray
     The others belong to parts of the body that the picture cuts off: nothing is known of them,
     so they are not drawn.
     """
-    size = mask.shape[0]
     outside = (mask <= MASK_LEVEL).astype(np.uint8)
     distance = cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_3)
-    pixel = np.floor((points[:, :2] * 0.5 + 0.5) * size).astype(np.int64)
-    inside = ((pixel >= 0) & (pixel < size)).all(axis=1)
-    x, y = np.clip(pixel, 0, size - 1).T
-    return np.asarray(inside & (distance[y, x] <= MARGIN))
+    inside, column, row = _pixels(points, mask.shape[0])
+    return np.asarray(inside & (distance[row, column] <= MARGIN))
+
+
+def _pixels(
+    points: NDArray[np.float32], size: int
+) -> tuple[NDArray[np.bool_], NDArray[np.intp], NDArray[np.intp]]:
+    """As :func:`pixel_of`, for normalised projections."""
+    return pixel_of(to_pixels(points, size), size)
 
 
 def _in_front(points: NDArray[np.float32], scale: float) -> NDArray[np.bool_]:
     size = Z_BUFFER_PIXELS
-    pixel = np.floor((points[:, :2] * 0.5 + 0.5) * size).astype(np.int64)
-    inside = ((pixel >= 0) & (pixel < size)).all(axis=1)
-    index = np.where(inside, pixel[:, 1] * size + pixel[:, 0], size * size)
+    inside, column, row = _pixels(points, size)
+    index = np.where(inside, row * size + column, size * size)
     nearest = np.full(size * size + 1, np.inf, dtype=np.float32)
     np.minimum.at(nearest, index, points[:, 2])
     return np.asarray(points[:, 2] <= nearest[index] + DEPTH_TOLERANCE * scale)

@@ -12,7 +12,8 @@ import pytest
 from made_avatars import arrays, jpeg, made_avatar, plain, png
 from safetensors.numpy import load, save
 
-from cvthead.avatar import MAX_BYTES, Avatar
+from cvthead.avatar import Avatar
+from cvthead.avatar_file import MAX_BYTES
 from cvthead.errors import AvatarFileError
 
 METADATA = {

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import cv2
 import numpy as np
 import pytest
 
 from cvthead.camera import Camera
 from cvthead.coefficients import Coefficients
-from cvthead.driving import at_neck, drive
+from cvthead.driving import Portrait, at_neck, drive
 from cvthead.head.model import HeadModel, Region
 from cvthead.tracking.tracker import TrackedFace
 
@@ -56,7 +54,7 @@ def test_the_body_turns_along_in_the_official_preset(head: HeadModel) -> None:
     driver = source.with_joints({"global": (0, 0.4, 0)})
     face = TrackedFace(driver, CAMERA, np.zeros((478, 3), np.float32), 1.0, (0, 0, 1, 1), 1.0)
     for preset, joint in (("official", "global"), ("open", "neck")):
-        avatar = SimpleNamespace(coefficients=source, camera=CAMERA, preset=preset)
+        avatar = Portrait(source, CAMERA, preset)
         coefficients, camera = drive(head, avatar, face)
         assert np.allclose(coefficients.joint(joint), (0, 0.4, 0), atol=1e-6)
         assert camera == CAMERA

@@ -1,9 +1,11 @@
-"""Spiral neighbourhoods of a triangle mesh (SpiralNet++, Gong et al. 2019)."""
+"""Spiral neighbourhoods of the open head's mesh."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+
+from cvthead.head.spirals import spirals_of
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -34,34 +36,5 @@ def rings(points: Floats, faces: Ints) -> list[list[int]]:
 
 
 def spirals(points: Floats, faces: Ints, length: int) -> Ints:
-    """(N, length): each vertex, its first ring, then further rings, cut to ``length``.
-
-    A component with fewer vertices is filled up with the nearest others.
-    """
-    around = rings(points, faces)
-    table = np.empty((len(points), length), np.int64)
-    for vertex, first in enumerate(around):
-        spiral, last = [vertex], first
-        spiral += last
-        while len(spiral) < length and last:
-            last = _next_ring(around, last, spiral)
-            spiral += last
-        if len(spiral) < length:
-            order = np.argsort(((points - points[vertex]) ** 2).sum(1), kind="stable")
-            spiral += [int(v) for v in order if v not in set(spiral)]
-        table[vertex] = spiral[:length]
-    return table
-
-
-def _next_ring(around: list[list[int]], last: list[int], spiral: list[int]) -> list[int]:
-    inside = set(last)
-    seen = set(spiral)
-    found: list[int] = []
-    for vertex in last:
-        ring = around[vertex]
-        start = next((i + 1 for i, v in enumerate(ring) if v in inside), 0)
-        for other in ring[start:] + ring[:start]:
-            if other not in seen:
-                seen.add(other)
-                found.append(other)
-    return found
+    """(N, length) spirals over :func:`rings`, see :func:`spirals_of`."""
+    return spirals_of(rings(points, faces), points, length)

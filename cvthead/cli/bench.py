@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 from typing import Any
 
 from cvthead.benchmark import time_drive, time_encode, time_render, time_torch
@@ -12,6 +11,7 @@ from cvthead.cli.portrait import add_portrait_options
 from cvthead.errors import InputError
 from cvthead.images import read_image
 from cvthead.pipeline import Pipeline
+from cvthead.runtime.threads import cores
 
 TITLES = {
     "encode": "Once per portrait",
@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> None:
         if value is not None and value < 1:
             raise InputError(f"--{name} is {value}", hint="use 1 or more")
     image = read_image(args.portrait)
-    threads = args.threads or len(os.sched_getaffinity(0))
+    threads = args.threads or cores()
     pipeline = Pipeline.load(args.preset, threads=threads)
     avatar = pipeline.encode(image, face=args.face)
     report: dict[str, Any] = {

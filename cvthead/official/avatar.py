@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save as save_tensors
 
+from cvthead.avatar_file import opened, packed
 from cvthead.camera import CROP_PIXELS, Camera
 from cvthead.coefficients import EXPRESSION_SIZE, POSE_SIZE, SHAPE_SIZE, Coefficients
-from cvthead.errors import AvatarFileError, CoefficientsError
 from cvthead.files import write_file
 from cvthead.model.config import PAPER
 from cvthead.official.crop import FaceSquare
@@ -22,7 +21,6 @@ from cvthead.official.manifest import PRESET
 
 FORMAT = "cvthead-official-avatar"
 VERSION = "1"
-MAX_BYTES = 4 * 2**20
 VERTICES = 5023  # of FLAME
 ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
     "descriptors": ("F32", (VERTICES, PAPER.descriptor_size)),
@@ -84,8 +82,7 @@ class OfficialAvatar:
             "preset": self.preset,
             "fingerprint": self.fingerprint,
         }
-        contiguous = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
-        return save_tensors(contiguous, metadata=metadata)
+        return packed(tensors, metadata)
 
     def save(self, path: Path | str) -> None:
         """Write the file; an existing one is replaced only when the new one is complete.
@@ -103,24 +100,14 @@ class OfficialAvatar:
             AvatarFileError: missing, damaged, not such an avatar, or with impossible contents.
         """
         hint = "encode the portrait again"
-        try:
-            if Path(path).stat().st_size > MAX_BYTES:
-                raise ValueError(f"larger than {MAX_BYTES >> 20} MiB")
-            with safe_open(str(path), framework="np") as file:
-                metadata = file.metadata() or {}
-                if (metadata.get("format"), metadata.get("version")) != (FORMAT, VERSION):
-                    raise ValueError(f"its format is not {FORMAT} {VERSION}")
-                fingerprint = metadata.get("fingerprint", "")
-                if not re.fullmatch("[0-9a-f]{16}", fingerprint):
-                    raise ValueError("its fingerprint is missing or malformed")
-                arrays = {name: _array(file, name) for name in ARRAYS}
-            return _avatar(arrays, fingerprint)
-        except FileNotFoundError as error:
-            raise AvatarFileError(f"{path} does not exist", hint=hint) from error
-        except (SafetensorError, OSError, ValueError, CoefficientsError) as error:
-            raise AvatarFileError(
-                f"{path} is damaged or not an avatar of the official preset: {error}", hint=hint
-            ) from error
+        with opened(path, "an avatar of the official preset", hint=hint) as file:
+            metadata = file.metadata() or {}
+            if (metadata.get("format"), metadata.get("version")) != (FORMAT, VERSION):
+                raise ValueError(f"its format is not {FORMAT} {VERSION}")
+            fingerprint = metadata.get("fingerprint", "")
+            if not re.fullmatch("[0-9a-f]{16}", fingerprint):
+                raise ValueError("its fingerprint is missing or malformed")
+            return _avatar({name: _array(file, name) for name in ARRAYS}, fingerprint)
 
 
 def is_official(path: Path) -> bool:

@@ -11,6 +11,7 @@ from scipy.sparse import csc_matrix
 
 from cvthead.errors import AssetError
 from cvthead.head.hierarchy import SPIRAL_LENGTH, MeshHierarchy
+from cvthead.head.spirals import spirals_of
 from cvthead.official.halfedges import HalfedgeMesh
 from cvthead.official.unpickle import HINT, load_pickle
 
@@ -36,42 +37,14 @@ def read_hierarchy(path: Path) -> MeshHierarchy:
         up = [_weights(tables["up_transform"][k], COUNTS[k : k + 2]) for k in range(LEVELS)]
     except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
         raise AssetError(f"{path} is not the released transform.pkl: {error}", hint=HINT) from error
-    tables_of_levels = tuple(spirals(p, f) for p, f in zip(points, faces, strict=True))
+    tables_of_levels = tuple(_spirals(p, f) for p, f in zip(points, faces, strict=True))
     return MeshHierarchy(tuple(down), tuple(up), tables_of_levels)
 
 
-def spirals(points: NDArray[np.float64], faces: Ints) -> Ints:
-    """(n, 9) each vertex, its ring clockwise, then further rings, cut to nine (SpiralNet++).
-
-    A part of fewer vertices is filled up with the nearest others.
-    """
+def _spirals(points: NDArray[np.float64], faces: Ints) -> Ints:
     mesh = HalfedgeMesh(len(points), (tuple(face) for face in faces.tolist()))
     rings = [mesh.ring(vertex) for vertex in range(len(points))]
-    table = np.empty((len(points), SPIRAL_LENGTH), np.int32)
-    for vertex, first in enumerate(rings):
-        spiral, last = [vertex, *first], first
-        while len(spiral) < SPIRAL_LENGTH and last:
-            last = _next_ring(rings, last, spiral)
-            spiral += last
-        if len(spiral) < SPIRAL_LENGTH:
-            order = np.argsort(((points - points[vertex]) ** 2).sum(1), kind="stable")
-            spiral += [int(other) for other in order if other not in set(spiral)]
-        table[vertex] = spiral[:SPIRAL_LENGTH]
-    return table
-
-
-def _next_ring(rings: list[list[int]], last: list[int], spiral: list[int]) -> list[int]:
-    inside, seen = set(last), set(spiral)
-    found: list[int] = []
-    for vertex in last:
-        ring = rings[vertex]
-        # The walk begins behind the first neighbour that lies in the ring before.
-        start = next((i + 1 for i, v in enumerate(ring) if v in inside), 0)
-        for other in ring[start:] + ring[:start]:
-            if other not in seen:
-                seen.add(other)
-                found.append(other)
-    return found
+    return spirals_of(rings, points, SPIRAL_LENGTH).astype(np.int32)
 
 
 def _faces(value: Any, count: int) -> Ints:

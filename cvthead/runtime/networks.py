@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,9 @@ from numpy.typing import NDArray
 from cvthead.camera import CROP_PIXELS
 from cvthead.deformation import MAX_SHELL_POINTS
 from cvthead.runtime.model_folder import DESCRIBE, PAINT, ModelFolder
+from cvthead.runtime.sessions import open_session
 from cvthead.runtime.splat import EMPTY_DEPTH, splat
+from cvthead.runtime.threads import cores
 from cvthead.runtime.warp import dense_flow, warp
 from cvthead.source import Source
 
@@ -74,8 +75,8 @@ class Networks:
             AssetError: a file is missing or altered.
         """
         folder = ModelFolder.load(path)
-        count = threads or min(MAX_THREADS, len(os.sched_getaffinity(0)))
-        describe, paint = (_open(folder.read(name), count) for name in (DESCRIBE, PAINT))
+        count = threads or min(MAX_THREADS, cores())
+        describe, paint = (open_session(folder.read(name), count) for name in (DESCRIBE, PAINT))
         _, size, _, channels = paint.get_inputs()[0].shape
         row_size = channels - 2 + PLACE_SIZE
         return cls(describe, paint, row_size, size, folder.fingerprint, folder.preset)
@@ -140,11 +141,3 @@ def reach_of(depth: Array, warped: NDArray[np.uint8]) -> NDArray[np.uint8]:
     size = warped.shape[0]
     points = cv2.resize(closed, (size, size), interpolation=cv2.INTER_LINEAR)
     return np.asarray(np.maximum(points, cv2.dilate(warped[..., 3], SOFT_EDGE)), np.uint8)
-
-
-def _open(data: bytes, threads: int) -> ort.InferenceSession:
-    options = ort.SessionOptions()
-    options.intra_op_num_threads = threads
-    options.inter_op_num_threads = 1
-    options.log_severity_level = 3
-    return ort.InferenceSession(data, options, providers=["CPUExecutionProvider"])

@@ -2,8 +2,16 @@
 
 from __future__ import annotations
 
+import os
+
 import cv2
 from threadpoolctl import threadpool_limits
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    allowed = getattr(os, "sched_getaffinity", None)  # Linux alone has it
+    return len(allowed(0)) if allowed else os.cpu_count() or 1
 
 
 def one_thread_per_call() -> None:

@@ -13,6 +13,7 @@ import onnxruntime as ort
 from numpy.typing import NDArray
 
 from cvthead.errors import AssetError, ImageError
+from cvthead.runtime.sessions import open_session
 
 RECORD_NAME = "networks.json"
 
@@ -55,11 +56,7 @@ def open_network(name: str, *, threads: int = 1) -> ort.InferenceSession:
     entry = network_record().get(name)
     if entry is None or hashlib.sha256(contents).hexdigest() != entry["sha256"]:
         raise _broken(name, "not the recorded file")
-    options = ort.SessionOptions()
-    options.intra_op_num_threads = threads
-    options.inter_op_num_threads = 1
-    options.log_severity_level = 3
-    return ort.InferenceSession(contents, options, providers=["CPUExecutionProvider"])
+    return open_session(contents, threads)
 
 
 def run(session: ort.InferenceSession, batch: NDArray[np.float32]) -> list[NDArray[np.float32]]:
