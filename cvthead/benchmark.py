@@ -16,7 +16,7 @@ from cvthead.controls import Controls, resolve
 from cvthead.driving import drive
 from cvthead.images import ImageFormat, decode_image, encode_image
 from cvthead.pipeline import Pipeline, without_person
-from cvthead.runtime.networks import PLACE_SIZE
+from cvthead.runtime.place import PLACE_SIZE
 from cvthead.source import cut_head, read_source
 from cvthead.tracking.tracker import TrackedFace
 
@@ -74,7 +74,7 @@ def time_render(pipeline: Pipeline, avatar: Avatar, count: int) -> dict[str, dic
     for controls in turning(WARM_UP + count):
         pose = resolve(avatar.coefficients, avatar.camera, controls, pipeline.arkit)
         points = watch.time("pose", pipeline.pose, avatar, *pose)
-        placed = watch.time("splat and warp", networks.place, points, avatar.rows, avatar.portrait)
+        placed = watch.time("splat and warp", pipeline.place, avatar, points)
         watch.time("U-Net", networks.paint, [placed])
         frame = watch.time("all of render", pipeline.render, avatar, controls)
         picture = watch.time("composite on colour", frame.over, (255, 255, 255))
@@ -145,7 +145,7 @@ def time_torch(threads: int) -> dict[str, dict[str, float]]:
     descriptors = torch.rand(1, layout.vertices, paper.config.descriptor_size)
     with torch.inference_mode():
         for _ in range(WARM_UP + BASELINE_RUNS):
-            watch.time("open preset", ours.paint, points, rows, portrait, CROP_PIXELS)
+            watch.time("open preset", ours.paint, points, rows, portrait)
             vertices = points[:, : layout.vertices]
             watch.time("paper preset", paper.paint, vertices, descriptors, CROP_PIXELS)
     return watch.summary(skipped=WARM_UP)

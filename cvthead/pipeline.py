@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvthead.avatar import Avatar
-from cvthead.camera import Camera
+from cvthead.camera import CROP_PIXELS, Camera
 from cvthead.coefficients import Coefficients
 from cvthead.controls import Controls, resolve
 from cvthead.deformation import DeformationModel
@@ -26,6 +26,7 @@ from cvthead.head.model import HeadModel
 from cvthead.points import FAR_AWAY, PointLayout
 from cvthead.runtime.model_folder import packaged
 from cvthead.runtime.networks import Networks
+from cvthead.runtime.place import Placed, place
 from cvthead.source import (
     HeadCrop,
     Source,
@@ -166,6 +167,11 @@ class Pipeline:
         points[~avatar.drawn] = FAR_AWAY
         return points
 
+    def place(self, avatar: Avatar, points: NDArray[np.float32]) -> Placed:
+        """Splat the descriptors and carry the portrait's pixels; see cvthead.runtime.place."""
+        size = self.networks.splat_size
+        return place(self.layout, points, avatar.rows, avatar.portrait, size, CROP_PIXELS)
+
     def paint(self, avatar: Avatar, points: NDArray[np.float32]) -> Frame:
         """Splat, warp and U-Net (paper section 3.4)."""
         return self.paint_many([(avatar, points)])[0]
@@ -175,7 +181,7 @@ class Pipeline:
         inputs = []
         for avatar, points in frames:
             self._check(avatar)
-            inputs.append(self.networks.place(points, avatar.rows, avatar.portrait))
+            inputs.append(self.place(avatar, points))
         painted = self.networks.paint(inputs)
         return [Frame(np.ascontiguousarray(rgba[..., :3]), rgba[..., 3]) for rgba in painted]
 

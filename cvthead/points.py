@@ -28,11 +28,13 @@ class PointLayout:
         vertices: N, mesh vertices.
         edges: (D, 2) end vertices of each midpoint.
         mirror: (N + D,) the mirrored counterpart of each point.
+        detail_faces: (F, 3) triangles of face, eyes and mouth.
     """
 
     vertices: int
     edges: NDArray[np.int32]
     mirror: NDArray[np.int32]
+    detail_faces: NDArray[np.int32]
 
     @classmethod
     def of(cls, head: HeadModel) -> PointLayout:
@@ -45,7 +47,8 @@ class PointLayout:
         twin = [number.get(tuple(edge), i) for i, edge in enumerate(flipped.tolist())]
         count = len(head.template)
         mirror = np.concatenate([head.mirror, np.asarray(twin) + count])
-        return cls(count, edges.astype(np.int32), mirror.astype(np.int32))
+        faces = head.faces[detail[head.faces].all(1)]
+        return cls(count, edges.astype(np.int32), mirror.astype(np.int32), faces)
 
     @property
     def surface(self) -> int:

@@ -80,6 +80,13 @@ def portrait_pixels(source: Array) -> NDArray[np.uint8]:
     return np.rint(shown).astype(np.uint8)
 
 
+def as_network_input(pixels: NDArray[np.uint8]) -> Array:
+    """(S, S, 4) uint8 of an Avatar's portrait -> (4, S, S) as :func:`network_input` has it."""
+    scale = np.array([2 / 255, 2 / 255, 2 / 255, 1 / 255], np.float32)
+    out = pixels * scale - np.array([1, 1, 1, 0], np.float32)
+    return np.ascontiguousarray(out.transpose(2, 0, 1))
+
+
 def cut_head(tracker: Tracker, image: NDArray[np.uint8], face: TrackedFace) -> HeadCrop:
     """Crop, mask and camera of a tracked face."""
     crop = head_crop(tracker.head, face.coefficients, face.camera)

@@ -8,7 +8,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -18,13 +17,12 @@ from cvthead.errors import AssetError
 from cvthead.head.hierarchy import MeshHierarchy
 from cvthead.images import read_image
 from cvthead.model import splat as torch_splat
-from cvthead.model import warp as torch_warp
 from cvthead.model.config import OPEN
 from cvthead.model.cvthead import CVTHead
 from cvthead.runtime.model_folder import PAINT, RECORD, WEIGHTS, ModelFolder, packaged
 from cvthead.runtime.networks import Networks
 from cvthead.runtime.splat import splat
-from cvthead.runtime.warp import dense_flow, warp
+from cvthead.source import as_network_input
 from cvthead.weights import load_into
 
 PORTRAIT = Path(__file__).parents[1] / "examples" / "astronaut.png"
@@ -59,23 +57,6 @@ def test_splat_is_the_one_the_network_was_trained_with(seed: int) -> None:
     assert np.array_equal(splat(points, rows, 64), expected[0].permute(1, 2, 0).numpy())
 
 
-def test_warp_is_the_one_the_network_was_trained_with() -> None:
-    rng = np.random.default_rng(0)
-    flow = cv2.GaussianBlur(rng.normal(size=(128, 128, 2)), (0, 0), 8).astype(np.float32)
-    seen = (rng.random((128, 128)) > 0.7).astype(np.float32)
-    seen[:40, :60] = 0
-    portrait = cv2.GaussianBlur(rng.uniform(0, 255, (256, 256, 4)), (0, 0), 2).astype(np.uint8)
-    planes = torch.from_numpy(flow).permute(2, 0, 1)[None]
-    expected = torch_warp.dense_flow(planes, torch.from_numpy(seen)[None, None], 256)
-    dense = dense_flow(flow, seen, 256)
-    assert np.abs(dense - expected[0].permute(1, 2, 0).numpy()).max() < 1e-5
-    image = torch.from_numpy(portrait.astype(np.float32)).permute(2, 0, 1)[None]
-    shown = torch_warp.warp(image, expected)[0].permute(1, 2, 0).numpy()
-    # OpenCV rounds to grey levels and places to 1/32 pixel.
-    assert np.abs(warp(portrait, dense) - shown).max() < 4
-    assert np.abs(warp(portrait, dense) - shown).mean() < 0.5
-
-
 def test_frame_is_the_one_of_the_float_network(
     pipeline: Pipeline, avatar: Avatar, model: CVTHead
 ) -> None:
@@ -83,13 +64,11 @@ def test_frame_is_the_one_of_the_float_network(
         posed = avatar.coefficients.with_joints({"global": (0.1, turn, 0), "jaw": (0.2, 0, 0)})
         points = pipeline.pose(avatar, posed, avatar.camera)
         frame = pipeline.paint(avatar, points)
-        portrait = avatar.portrait.transpose(2, 0, 1) * np.array([2, 2, 2, 1])[:, None, None] / 255
-        portrait -= np.array([1, 1, 1, 0])[:, None, None]
+        warped = as_network_input(pipeline.place(avatar, points).warped)
         rgb, logits = model.paint(
             torch.from_numpy(points)[None],
             torch.from_numpy(avatar.rows)[None],
-            torch.from_numpy(portrait.astype(np.float32))[None],
-            256,
+            torch.from_numpy(warped)[None],
         )
         alpha = logits[0, 0].sigmoid().numpy()
         expected = (rgb[0].permute(1, 2, 0).numpy() + 1) * 127.5 * alpha[..., None]

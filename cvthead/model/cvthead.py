@@ -15,9 +15,8 @@ from cvthead.model.pyramid_encoder import PyramidEncoder
 from cvthead.model.spiral import SpiralUpsampler
 from cvthead.model.splat import splat
 from cvthead.model.transformer import Transformer
-from cvthead.model.warp import dense_flow, warp
 from cvthead.points import PointLayout
-from cvthead.runtime.networks import PLACE_SIZE
+from cvthead.runtime.place import PLACE_SIZE
 from cvthead.runtime.splat import EMPTY_DEPTH
 
 FILL_LEVELS = 3
@@ -96,25 +95,22 @@ class CVTHead(nn.Module):
         shell = vertex.gather(1, anchor[..., None].expand(-1, -1, vertex.shape[-1]))
         return torch.cat([vertex, middle, shell], dim=1)
 
-    def paint(
-        self, points: Tensor, descriptors: Tensor, portrait: Tensor, size: int
-    ) -> tuple[Tensor, Tensor]:
+    def paint(self, points: Tensor, descriptors: Tensor, warped: Tensor) -> tuple[Tensor, Tensor]:
         """Neural vertex rendering (paper section 3.4).
 
         Args:
             points: (b, p, 3) normalised driven projections.
             descriptors: (b, p, C + 3) from :meth:`describe`.
-            portrait: (b, 4, 256, 256), the source as given to :meth:`describe`.
-            size: output height and width, a multiple of 32.
+            warped: (b, 4, size, size), the source as given to :meth:`describe`, carried to the
+                driven points (cvthead.runtime.place); size is a multiple of 32.
 
         Returns:
             RGB (b, 3, size, size) in [-1, 1] and mask logits (b, 1, size, size).
         """
-        image = splat(points, to_flow(descriptors, points), size // self.config.unet_unshuffle)
-        flow, seen = image[:, -PLACE_SIZE:-1], image[:, -1:]
+        values = torch.cat([descriptors[..., :-PLACE_SIZE], descriptors[..., -1:]], dim=-1)
+        image = splat(points, values, warped.shape[-1] // self.config.unet_unshuffle)
         with torch.autocast(image.device.type, enabled=False):
-            warped = warp(portrait, dense_flow(flow, seen, size))
-            filled = self.filled(torch.cat([image[:, :-PLACE_SIZE], seen], dim=1))
+            filled = self.filled(image)
         out: tuple[Tensor, Tensor] = self.unet(
             filled.contiguous(memory_format=torch.channels_last), warped
         )
@@ -125,12 +121,3 @@ class CVTHead(nn.Module):
         covered = (image[:, :1] > EMPTY_DEPTH).float()
         dense, coverage = fill(image[:, :-1], covered, FILL_LEVELS)
         return torch.cat([dense, image[:, -1:], *coverage], dim=1)
-
-
-def to_flow(descriptors: Tensor, points: Tensor) -> Tensor:
-    """Descriptors whose place in the portrait is counted from the driven point."""
-    place = slice(-PLACE_SIZE, 2 - PLACE_SIZE)
-    flow = descriptors[..., place] - points[..., :2]
-    return torch.cat(
-        [descriptors[..., : place.start], flow, descriptors[..., place.stop :]], dim=-1
-    )

@@ -13,6 +13,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from cvthead.runtime.place import SEEN, SEEN_MIRRORED
+
 COLOUR_SIZE = 3
 
 
@@ -58,7 +60,7 @@ class PixelAlignedFusion(nn.Module):
 
         Returns:
             (b, p, size + 3): colour, learned channels, then the point's place in the portrait:
-            normalised x and y, and 1 where the portrait sees the point.
+            normalised x and y, and whether the portrait sees it (see cvthead.runtime.place).
         """
         own = visible[..., None]
         other = own[:, mirror] * (1 - own)
@@ -72,4 +74,5 @@ class PixelAlignedFusion(nn.Module):
         guess = torch.tanh(out[..., :COLOUR_SIZE].float())
         painted = colour + mirrored_colour + (1 - known) * guess
         learned = out[..., COLOUR_SIZE:].float()
-        return torch.cat([painted, learned, points[..., :2], own], dim=-1)
+        seen = SEEN * own + SEEN_MIRRORED * other
+        return torch.cat([painted, learned, points[..., :2], seen], dim=-1)

@@ -21,8 +21,11 @@ from torch.utils.data import Dataset
 from cvthead.deformation import MAX_SHELL_POINTS
 from cvthead.driving import at_neck
 from cvthead.head.model import HeadModel
+from cvthead.model.config import OPEN
 from cvthead.points import FAR_AWAY, PointLayout
-from cvthead.source import driven_points, network_input
+from cvthead.runtime.place import SEEN, SEEN_MIRRORED, place
+from cvthead.source import as_network_input, driven_points, network_input, portrait_pixels
+from cvthead.training.details import ZOOMED, detail_weights, zoom_corner
 from cvthead.training.records import Frame, Record
 from cvthead.visibility import inside_mask, on_person
 
@@ -114,17 +117,25 @@ class PairDataset(Dataset[dict[str, Tensor]]):
             drawn = flip_order(drawn.astype(np.float32), self.layout) > 0
             anchor = self.head.mirror[anchor].astype(np.int64)
             views = [mirrored(v, self.layout) for v in views]
+        driven = [np.where(drawn[:, None], v.points, FAR_AWAY) for v in views]
+        landmarks = [self.head.landmarks(v.points[: self.layout.vertices]) for v in views]
+        rows = np.concatenate([own[:, :2], self._seen(visible)[:, None]], axis=1)
+        portrait = portrait_pixels(network)
+        zoomed = int(rng.integers(len(ZOOMED)))
         stack: dict[str, NDArray[Any]] = {
             "source": network,
             "points": own,
             "visible": visible,
             "anchor": anchor,
-            "window": rng.random(2),
+            "window": rng.random(3),
+            "zoom": np.array([zoom_corner(each, zoomed, self.size) for each in landmarks]),
+            "weight": np.stack([detail_weights(each, self.size)[None] for each in landmarks]),
             "background": np.full((VIEWS, 3, 1, 1), 1, np.float32) * rng.random((1, 3, 1, 1)),
             "image": np.stack([self._resized(v.image).transpose(2, 0, 1) for v in views]),
             "mask": np.stack([self._resized(v.mask)[None] for v in views]),
             "valid": np.stack([self._resized(v.valid)[None] > 0.99 for v in views]),
-            "driven": np.stack([np.where(drawn[:, None], v.points, FAR_AWAY) for v in views]),
+            "driven": np.stack(driven),
+            "warped": np.stack([self._warped(each, rows, portrait) for each in driven]),
         }
         return {
             name: torch.from_numpy(
@@ -132,6 +143,18 @@ class PairDataset(Dataset[dict[str, Tensor]]):
             )
             for name, value in stack.items()
         }
+
+    def _seen(self, visible: Array) -> Array:
+        """(P,) how the portrait sees each point, see cvthead.runtime.place."""
+        across = np.zeros_like(visible)
+        across[: self.layout.surface] = visible[self.layout.mirror]
+        return SEEN * visible + SEEN_MIRRORED * across * (1 - visible)
+
+    def _warped(self, driven: Array, rows: Array, portrait: NDArray[np.uint8]) -> Array:
+        """(4, S, S) portrait carried to the driven points, as a network input."""
+        splat_size = self.size // OPEN.unet_unshuffle
+        placed = place(self.layout, driven, rows, portrait, splat_size, self.size)
+        return as_network_input(placed.warped)
 
     def _resized(self, image: Array) -> Array:
         if image.shape[0] == self.size:

@@ -25,7 +25,7 @@ from cvthead.model.config import OPEN
 from cvthead.model.cvthead import CVTHead
 from cvthead.points import PointLayout
 from cvthead.runtime.model_folder import DESCRIBE, PAINT, WEIGHTS, write_record
-from cvthead.runtime.networks import place
+from cvthead.runtime.place import place
 from cvthead.source import portrait_pixels
 from cvthead.training.dataset import PairDataset
 from cvthead.training.onnx_export import export_describe, export_paint
@@ -62,9 +62,8 @@ def averaged_model(checkpoint: Path) -> tuple[CVTHead, int]:
 def frame_inputs(describe: Path, records: Path, count: int) -> list[Feed]:
     """Inputs of the frame network for driven views of training records."""
     head = HeadModel.load()
-    dataset = PairDataset(
-        records, head, PointLayout.of(head), size=CROP_PIXELS, seed=SEED, samples=count
-    )
+    layout = PointLayout.of(head)
+    dataset = PairDataset(records, head, layout, size=CROP_PIXELS, seed=SEED, samples=count)
     session = ort.InferenceSession(str(describe), providers=["CPUExecutionProvider"])
     feeds: list[Feed] = []
     for index in range(count):
@@ -72,7 +71,7 @@ def frame_inputs(describe: Path, records: Path, count: int) -> list[Feed]:
         inputs = {name: sample[name][None] for name in DESCRIBE_INPUTS}
         rows = session.run(None, inputs)[0][0]
         portrait = portrait_pixels(sample["source"])
-        placed = place(sample["driven"][0], rows, portrait, SPLAT_SIZE)
+        placed = place(layout, sample["driven"][0], rows, portrait, SPLAT_SIZE, CROP_PIXELS)
         feeds.append({"splat": placed.splat[None], "warped": placed.warped[None]})
     return feeds
 

@@ -6,16 +6,19 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
+from cvthead.training.details import ZOOM_SIDE
 from cvthead.training.perceptual import STLPIPS
 
 WINDOW = 0.75  # side, as a share of the view's
+ZOOM_SHARE = 0.4  # of the steps, whose perceptual loss sees enlarged eyes or mouths
 
 
 @dataclass(frozen=True)
 class LossWeights:
     l1: float = 1.0
-    perceptual: float = 2.0
+    perceptual: float = 4.0
     dice: float = 0.3
 
 
@@ -25,6 +28,21 @@ def window(place: Tensor, size: int) -> tuple[slice, slice]:
     side = round(WINDOW * size)
     top, left = (int(x * (size - side) + 0.5) for x in place.tolist())
     return slice(top, top + side), slice(left, left + side)
+
+
+def zoomed(image: Tensor, corners: Tensor) -> Tensor:
+    """A square of each picture, as large as :func:`window` makes it.
+
+    Args:
+        image: (b, c, s, s).
+        corners: (b, 2) top and left, see cvthead.training.details.zoom_corner.
+    """
+    side, size = round(ZOOM_SIDE * image.shape[-1]), round(WINDOW * image.shape[-1])
+    parts = [
+        one[:, top : top + side, left : left + side]
+        for one, (top, left) in zip(image, corners.long().tolist(), strict=True)
+    ]
+    return F.interpolate(torch.stack(parts), (size, size), mode="bilinear", align_corners=False)
 
 
 def composite(rgb: Tensor, mask: Tensor, background: Tensor) -> Tensor:
@@ -39,7 +57,8 @@ def reconstruction_losses(
     Args:
         rgb: (b, 3, s, s) in [-1, 1]; logits: (b, 1, s, s) of the mask.
         batch: image (b, 3, s, s) in 0..1, mask and valid (b, 1, s, s), background (b, 3, 1, 1),
-            window (b, 2) in 0..1, of which the first is used.
+            weight (b, 1, s, s) of each pixel; zoom (b, 2), see :func:`zoomed`; window (b, 3) in
+            0..1: the first decides for all where the perceptual loss looks.
         perceptual: frozen distance network.
 
     Returns:
@@ -52,16 +71,20 @@ def reconstruction_losses(
     own = composite(rgb, mask, background)
     # Colour under the true mask as well, or a wrong mask would hide wrong colour.
     painted = composite(rgb, target_mask, background)
-    area = (valid.sum() * 3).clamp(min=1)
-    l1 = (((painted - target).abs() + 0.5 * (own - target).abs()) * valid).sum() / area
+    weight = valid * batch["weight"]
+    area = (weight.sum() * 3).clamp(min=1)
+    l1 = (((painted - target).abs() + 0.5 * (own - target).abs()) * weight).sum() / area
     shown = own * valid + target * (1 - valid)
-    rows, columns = window(batch["window"][0], rgb.shape[-1])
+    place, kind = batch["window"][0, :2], batch["window"][0, 2]
+    if kind < ZOOM_SHARE:
+        shown, compared = (zoomed(image, batch["zoom"]) for image in (shown, target))
+    else:
+        rows, columns = window(place, rgb.shape[-1])
+        shown, compared = shown[..., rows, columns], target[..., rows, columns]
     overlap = (mask * target_mask * valid).sum()
     sizes = ((mask.square() + target_mask.square()) * valid).sum()
     return {
         "l1": l1,
-        "perceptual": perceptual(shown[..., rows, columns], target[..., rows, columns])
-        .float()
-        .mean(),
+        "perceptual": perceptual(shown, compared).float().mean(),
         "dice": 1 - 2 * overlap / sizes.clamp(min=1),
     }

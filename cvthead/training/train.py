@@ -82,14 +82,13 @@ def freeze_norms(model: nn.Module) -> None:
             module.eval()
 
 
-def render_views(model: CVTHead, batch: dict[str, Tensor], size: int) -> tuple[Tensor, Tensor]:
+def render_views(model: CVTHead, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
     descriptors = model.describe(
         batch["source"], batch["points"], batch["visible"], batch["anchor"]
     )
     descriptors = repeat(descriptors, "b p c -> (b v) p c", v=VIEWS)
-    portrait = repeat(batch["source"], "b c h w -> (b v) c h w", v=VIEWS)
     driven = rearrange(batch["driven"], "b v p c -> (b v) p c")
-    return model.paint(driven, descriptors, portrait, size)
+    return model.paint(driven, descriptors, rearrange(batch["warped"], "b v ... -> (b v) ..."))
 
 
 def train(
@@ -161,10 +160,10 @@ def train(
         for group in optimizer.param_groups:
             group["lr"] = learning_rate(config, step)
         with torch.autocast("cpu", torch.bfloat16):
-            rgb, logits = render_views(model, batch, config.size)
+            rgb, logits = render_views(model, batch)
             views = {
                 name: rearrange(batch[name], "b v ... -> (b v) ...")
-                for name in ("image", "mask", "valid", "background")
+                for name in ("image", "mask", "valid", "background", "weight", "zoom")
             } | {"window": batch["window"]}
             losses = reconstruction_losses(rgb, logits, views, perceptual)
         total = torch.stack([getattr(weights, k) * v for k, v in losses.items()]).sum()
