@@ -24,13 +24,15 @@ from cvthead.files import write_file
 from cvthead.images import DAMAGE
 
 FORMAT = "cvthead-avatar"
-VERSION = "2"
+VERSION = "3"
+PLACE_SIZE = 3  # x, y, seen
 CAMERA_FIELDS = ("scale", "tx", "ty")
 CROP_FIELDS = ("left", "top", "size")
 # Type (in safetensors' spelling) and shape of each array of a file. Letters stand for sizes that
 # differ from avatar to avatar: points, channels, vertices, shell points, bytes.
 ARRAYS: dict[str, tuple[str, tuple[int | str, ...]]] = {
-    "descriptors": ("F16", ("P", "C")),
+    "descriptors": ("U8", ("P", "C")),
+    "places": ("F16", ("P", PLACE_SIZE)),
     "offsets": ("F16", ("N", 3)),
     "shell_anchor": ("I32", ("K",)),
     "shell_offset": ("F16", ("K", 3)),
@@ -50,9 +52,10 @@ class Avatar:
     """One encoded portrait. Immutable; the encoder never runs again for it.
 
     Attributes:
-        descriptors: (P, C + 3) float16, in the order of the preset's PointLayout without the
-            unused shell points: V_F of the paper's section 3.3, then the point's x and y in the
-            portrait and 1 where the portrait sees it.
+        descriptors: (P, C) uint8, V_F of the paper's section 3.3 as codes that the frame network
+            reads, in the order of the preset's PointLayout without the unused shell points.
+        places: (P, 3) float16, each point's normalised x and y in the portrait, and 1 where the
+            portrait sees it, 0.5 where it sees only the mirrored point, else 0.
         drawn: (P,) bool, points that belong to the avatar; of the others, which the portrait cuts
             off, nothing is known.
         portrait: (256, 256, 4) uint8, the cropped person: RGB multiplied by the mask (grey 128
@@ -66,7 +69,8 @@ class Avatar:
         fingerprint: of the trained weights that made the descriptors.
     """
 
-    descriptors: NDArray[np.float16]
+    descriptors: NDArray[np.uint8]
+    places: NDArray[np.float16]
     drawn: NDArray[np.bool_]
     portrait: NDArray[np.uint8]
     deformation: Deformation
@@ -78,20 +82,21 @@ class Avatar:
     fingerprint: str
 
     def __post_init__(self) -> None:
-        for name in ("descriptors", "drawn", "portrait"):
+        for name in ("descriptors", "places", "drawn", "portrait"):
             constant = getattr(self, name).view()
             constant.flags.writeable = False  # shared between threads
             object.__setattr__(self, name, constant)
 
     @cached_property
-    def rows(self) -> NDArray[np.float32]:
-        """The descriptors in single precision, converted once."""
-        return self.descriptors.astype(np.float32)
+    def exact_places(self) -> NDArray[np.float32]:
+        """The places in single precision, converted once."""
+        return self.places.astype(np.float32)
 
     def to_bytes(self) -> bytes:
         """One safetensors file of less than 1 MB."""
-        tensors = {
+        tensors: dict[str, NDArray[Any]] = {
             "descriptors": self.descriptors,
+            "places": self.places,
             "drawn": self.drawn,
             "offsets": self.deformation.offsets.astype(np.float16),
             "shell_anchor": self.deformation.shell_anchor,
@@ -173,7 +178,7 @@ def _check_arrays(file: Any) -> None:
 
 
 def _avatar(arrays: dict[str, NDArray[Any]], metadata: dict[str, str]) -> Avatar:
-    for name in ("descriptors", "offsets", "shell_offset", "crop"):
+    for name in ("places", "offsets", "shell_offset", "crop"):
         if not np.isfinite(arrays[name]).all():
             raise ValueError(f"{name} holds NaN or infinity")
     anchor = arrays["shell_anchor"]
@@ -187,6 +192,7 @@ def _avatar(arrays: dict[str, NDArray[Any]], metadata: dict[str, str]) -> Avatar
     _picture("background", background, JpegImageFile, "RGB")
     return Avatar(
         arrays["descriptors"],
+        arrays["places"],
         arrays["drawn"],
         _picture("portrait", arrays["portrait"].tobytes(), PngImageFile, "RGBA"),
         Deformation(

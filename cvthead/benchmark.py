@@ -16,7 +16,6 @@ from cvthead.controls import Controls, resolve
 from cvthead.driving import drive
 from cvthead.images import ImageFormat, decode_image, encode_image
 from cvthead.pipeline import Pipeline, without_person
-from cvthead.runtime.place import PLACE_SIZE
 from cvthead.source import cut_head, read_source
 from cvthead.tracking.tracker import TrackedFace
 
@@ -139,13 +138,14 @@ def time_torch(threads: int) -> dict[str, dict[str, float]]:
     layout = PointLayout.of(HeadModel.load())
     ours = CVTHead(OPEN, hierarchy, layout).eval()
     paper = PaperCVTHead(hierarchy).eval()
-    portrait = torch.zeros(1, 4, CROP_PIXELS, CROP_PIXELS)
+    warped = torch.zeros(1, 4, CROP_PIXELS, CROP_PIXELS)
     points = torch.rand(1, layout.total, 3) * 2 - 1
-    rows = torch.rand(1, layout.total, OPEN.descriptor_size + PLACE_SIZE)
+    seen = torch.ones(1, layout.total)
+    rows = torch.rand(1, layout.total, OPEN.descriptor_size)
     descriptors = torch.rand(1, layout.vertices, paper.config.descriptor_size)
     with torch.inference_mode():
         for _ in range(WARM_UP + BASELINE_RUNS):
-            watch.time("open preset", ours.paint, points, rows, portrait)
+            watch.time("open preset", ours.paint, points, rows, seen, warped)
             vertices = points[:, : layout.vertices]
             watch.time("paper preset", paper.paint, vertices, descriptors, CROP_PIXELS)
     return watch.summary(skipped=WARM_UP)

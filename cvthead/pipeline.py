@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvthead.avatar import Avatar
-from cvthead.camera import CROP_PIXELS, Camera
+from cvthead.camera import Camera
 from cvthead.coefficients import Coefficients
 from cvthead.controls import Controls, resolve
 from cvthead.deformation import DeformationModel
@@ -113,9 +113,11 @@ class Pipeline:
         tracked = self.tracker.track(image, face=face, only_one=only_one)
         crop = cut_head(self.tracker, image, tracked)
         source = read_source(self.deformer, self.layout, crop, deform=deform)
+        used = self._used(source)
         return Avatar(
             self.describe(source),
-            source.drawn[: self._used(source)],
+            source.places(self.layout)[:used].astype(np.float16),
+            source.drawn[:used],
             portrait_pixels(source.network_input),
             source.deformation,
             crop.coefficients,
@@ -126,9 +128,9 @@ class Pipeline:
             self.fingerprint,
         )
 
-    def describe(self, source: Source) -> NDArray[np.float16]:
-        """(P, C + 3) descriptors of a source, unused shell points left out."""
-        return self.networks.describe(source)[: self._used(source)].astype(np.float16)
+    def describe(self, source: Source) -> NDArray[np.uint8]:
+        """(P, C) descriptor codes of a source, unused shell points left out."""
+        return self.networks.describe(source)[: self._used(source)]
 
     def _used(self, source: Source) -> int:
         return self.layout.surface + len(source.deformation.shell_anchor)
@@ -169,8 +171,14 @@ class Pipeline:
 
     def place(self, avatar: Avatar, points: NDArray[np.float32]) -> Placed:
         """Splat the descriptors and carry the portrait's pixels; see cvthead.runtime.place."""
-        size = self.networks.splat_size
-        return place(self.layout, points, avatar.rows, avatar.portrait, size, CROP_PIXELS)
+        return place(
+            self.layout,
+            points,
+            avatar.exact_places,
+            avatar.descriptors,
+            avatar.portrait,
+            self.networks.splat_size,
+        )
 
     def paint(self, avatar: Avatar, points: NDArray[np.float32]) -> Frame:
         """Splat, warp and U-Net (paper section 3.4)."""
@@ -196,7 +204,7 @@ class Pipeline:
             )
         points = self.layout.surface + len(avatar.deformation.shell_anchor)
         expected = {
-            "descriptors": (points, self.networks.row_size),
+            "descriptors": (points, self.networks.descriptor_size),
             "offsets": (self.layout.vertices, 3),
         }
         found = {

@@ -28,12 +28,14 @@ class PointLayout:
         vertices: N, mesh vertices.
         edges: (D, 2) end vertices of each midpoint.
         mirror: (N + D,) the mirrored counterpart of each point.
-        detail_faces: (F, 3) triangles of face, eyes and mouth.
+        detail_vertices: (V,) vertices of face, eyes and mouth.
+        detail_faces: (F, 3) triangles between those, numbered within detail_vertices.
     """
 
     vertices: int
     edges: NDArray[np.int32]
     mirror: NDArray[np.int32]
+    detail_vertices: NDArray[np.int64]
     detail_faces: NDArray[np.int32]
 
     @classmethod
@@ -47,8 +49,14 @@ class PointLayout:
         twin = [number.get(tuple(edge), i) for i, edge in enumerate(flipped.tolist())]
         count = len(head.template)
         mirror = np.concatenate([head.mirror, np.asarray(twin) + count])
-        faces = head.faces[detail[head.faces].all(1)]
-        return cls(count, edges.astype(np.int32), mirror.astype(np.int32), faces)
+        own, faces = np.unique(head.faces[detail[head.faces].all(1)], return_inverse=True)
+        return cls(
+            count,
+            edges.astype(np.int32),
+            mirror.astype(np.int32),
+            own.astype(np.int64),
+            faces.reshape(-1, 3).astype(np.int32),
+        )
 
     @property
     def surface(self) -> int:

@@ -13,6 +13,7 @@ from cvthead.crop import head_crop
 from cvthead.deformation import Deformation, DeformationModel, points, to_pixels
 from cvthead.head.model import HeadModel, Region
 from cvthead.points import PointLayout
+from cvthead.runtime.place import SEEN, SEEN_MIRRORED
 from cvthead.silhouette import person_mask
 from cvthead.tracking.tracker import TrackedFace, Tracker
 from cvthead.visibility import eroded, on_person, visible_points
@@ -60,10 +61,23 @@ class Source:
     visible: NDArray[np.bool_]
     drawn: NDArray[np.bool_]
 
+    def places(self, layout: PointLayout) -> Array:
+        """(P, 3) each point's x and y in the portrait, and how the portrait sees it."""
+        return places(layout, self.points, self.visible)
+
     @property
     def network_input(self) -> Array:
         """(4, 256, 256): RGB in [-1, 1], 0 outside the person, and the mask."""
         return network_input(self.head.image, self.head.mask)
+
+
+def places(layout: PointLayout, points: Array, visible: NDArray[np.bool_]) -> Array:
+    """(P, 3) normalised x and y of source projections (P, 3), then 1 where visible (P,), 0.5 where
+    only the mirrored point is, else 0."""
+    across = np.zeros_like(visible)
+    across[: layout.surface] = visible[layout.mirror]
+    seen = np.where(visible, SEEN, np.where(across, SEEN_MIRRORED, 0))
+    return np.concatenate([points[:, :2], seen[:, None]], axis=1).astype(np.float32)
 
 
 def network_input(image: NDArray[np.uint8], mask: Array) -> Array:
@@ -87,9 +101,11 @@ def as_network_input(pixels: NDArray[np.uint8]) -> Array:
     return np.ascontiguousarray(out.transpose(2, 0, 1))
 
 
-def cut_head(tracker: Tracker, image: NDArray[np.uint8], face: TrackedFace) -> HeadCrop:
-    """Crop, mask and camera of a tracked face."""
-    crop = head_crop(tracker.head, face.coefficients, face.camera)
+def cut_head(
+    tracker: Tracker, image: NDArray[np.uint8], face: TrackedFace, crop: Crop | None = None
+) -> HeadCrop:
+    """Crop, mask and camera of a tracked face; the crop is the head's own unless one is given."""
+    crop = crop or head_crop(tracker.head, face.coefficients, face.camera)
     pixels, valid = crop.cut(image)
     probability = tracker.networks.person_mask(pixels)
     camera = face.camera.in_crop(crop)

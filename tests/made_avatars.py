@@ -28,7 +28,8 @@ def png(size: int = 256, mode: str = "RGBA") -> bytes:
 def made_avatar(seed: int = 0, points: int = 50) -> Avatar:
     rng = np.random.default_rng(seed)
     return Avatar(
-        rng.normal(size=(points, 19)).astype(np.float16),
+        rng.integers(0, 256, (points, 16)).astype(np.uint8),
+        rng.normal(size=(points, 3)).astype(np.float16),
         rng.random(points) > 0.2,
         rng.integers(0, 256, (256, 256, 4)).astype(np.uint8),
         Deformation(
@@ -57,4 +58,5 @@ def plain(a: Avatar) -> tuple[object, ...]:
 def arrays(a: Avatar) -> tuple[np.ndarray, ...]:
     d, c = a.deformation, a.coefficients
     shell = d.shell_anchor, d.shell_offset
-    return a.descriptors, a.drawn, a.portrait, d.offsets, *shell, c.shape, c.expression, c.pose
+    points = a.descriptors, a.places, a.drawn
+    return *points, a.portrait, d.offsets, *shell, c.shape, c.expression, c.pose

@@ -18,7 +18,7 @@ from cvthead.errors import AvatarFileError
 
 METADATA = {
     "format": "cvthead-avatar",
-    "version": "2",
+    "version": "3",
     "preset": "open",
     "fingerprint": "0123456789abcdef",
 }
@@ -42,6 +42,10 @@ def with_value(name: str, index: Any, value: float) -> dict[str, np.ndarray]:
     array = tensors()[name].copy()
     array[index] = value
     return {name: array}
+
+
+def codes(*shape: int) -> np.ndarray:
+    return np.zeros(shape, np.uint8)
 
 
 def half(*shape: int) -> np.ndarray:
@@ -71,9 +75,14 @@ def test_arrays_cannot_be_changed() -> None:
         *(({name: tensors()[name].astype(np.int16)}, f"{name} has type") for name in tensors()),
         ({"shell_anchor": tensors()["shell_anchor"].astype(np.uint32)}, "shell_anchor has type"),
         # shapes, among them some that NumPy would broadcast
-        ({"descriptors": half(50)}, "descriptors has shape"),
-        ({"descriptors": half(50, 0)}, "descriptors"),
-        ({"descriptors": half(36, 24), "drawn": np.ones(36, bool)}, "fewer descriptors"),
+        ({"descriptors": codes(50)}, "descriptors has shape"),
+        ({"descriptors": codes(50, 0)}, "descriptors"),
+        ({"places": half(50, 2)}, "places has shape"),
+        ({"places": half(49, 3)}, "places has shape"),
+        (
+            {"descriptors": codes(36, 24), "places": half(36, 3), "drawn": np.ones(36, bool)},
+            "fewer descriptors",
+        ),
         ({"offsets": half(3)}, "offsets has shape"),
         ({"offsets": half(30, 1)}, "offsets has shape"),
         ({"offsets": half(1, 30, 3)}, "offsets has shape"),
@@ -83,7 +92,8 @@ def test_arrays_cannot_be_changed() -> None:
         ({"shell_anchor": np.zeros((), np.int32)}, "shell_anchor has shape"),
         (
             {
-                "descriptors": half(600, 24),
+                "descriptors": codes(600, 24),
+                "places": half(600, 3),
                 "drawn": np.ones(600, bool),
                 "shell_anchor": np.zeros(513, np.int32),
                 "shell_offset": half(513, 3),
@@ -94,7 +104,7 @@ def test_arrays_cannot_be_changed() -> None:
         ({"camera": np.ones(4)}, "camera has shape"),
         ({"camera": np.ones((3, 1))}, "camera has shape"),
         # values
-        (with_value("descriptors", (4, 2), NAN), "descriptors holds NaN"),
+        (with_value("places", (4, 2), NAN), "places holds NaN"),
         (with_value("offsets", (0, 0), INFINITY), "offsets holds NaN"),
         (with_value("shell_offset", (0, 0), -INFINITY), "shell_offset holds NaN"),
         (with_value("shell_anchor", 0, 30), "shell_anchor names a vertex"),

@@ -10,7 +10,7 @@ import pytest
 from cvthead import Avatar, Pipeline
 from cvthead.head.model import Region
 from cvthead.images import read_image
-from cvthead.runtime.place import PLACE_SIZE, SEEN, SEEN_MIRRORED, place
+from cvthead.runtime.place import SEEN, SEEN_MIRRORED, place
 from cvthead.runtime.triangles import FAR, rasterise
 from cvthead.runtime.warp import dense_flow, warp
 
@@ -104,8 +104,8 @@ def test_eyes_turn_by_the_angle_asked_for(pipeline: Pipeline, avatar: Avatar) ->
 def test_hidden_half_comes_from_the_other_side(pipeline: Pipeline, avatar: Avatar) -> None:
     layout = pipeline.layout
     head = pipeline.head
-    rows = avatar.rows[:, -PLACE_SIZE:].copy()
-    rows[:, -1] = SEEN
+    rows = avatar.exact_places.copy()
+    rows[:, 2] = SEEN
     points = pipeline.pose(avatar, avatar.coefficients, avatar.camera)
     # Pretend that the subject's left half was not seen.
     left = np.zeros(len(rows), bool)
@@ -116,8 +116,8 @@ def test_hidden_half_comes_from_the_other_side(pipeline: Pipeline, avatar: Avata
     portrait[part] = 0
     shown = []
     for seen in (SEEN_MIRRORED, 0.0):
-        rows[left, -1] = seen
-        warped = place(layout, points, rows, portrait, 128, SIZE).warped
+        rows[left, 2] = seen
+        warped = place(layout, points, rows, avatar.descriptors, portrait, 128).warped
         shown.append(float(warped[part].mean()))
     assert shown[0] > 60
     assert shown[1] < 5
@@ -128,7 +128,7 @@ def test_dense_flow_keeps_what_is_known_and_fills_the_rest() -> None:
     flow[..., 0] = 0.25
     seen = (np.random.default_rng(0).random((128, 128)) > 0.7).astype(np.float32)
     seen[40:60, 30:70] = 0
-    assert np.allclose(dense_flow(flow, seen, SIZE), [0.25, 0], atol=1e-4)
+    assert np.allclose(dense_flow(flow[..., 0], flow[..., 1], seen, SIZE), [0.25, 0], atol=1e-4)
 
 
 def test_warp_reads_the_portrait_at_the_flow() -> None:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
+
+Features = Literal["fused", "pixel-aligned", "transformer"]
 
 
 @dataclass(frozen=True)
@@ -25,6 +28,10 @@ class ModelConfig:
         point_embedding_size: learned channels per mesh vertex in the pixel-aligned branch.
         unet_sizes: widths of the U-Net from the finest level to the coarsest.
         unet_unshuffle: splat and U-Net work at 1/unet_unshuffle of the image size.
+        features: what the open preset's descriptors are made of; the other two are ablations:
+            "pixel-aligned" samples the encoder's U-Net at every point's projection, seen or not,
+            as S3F does, and has no transformer; "transformer" has no pixel-aligned features, nor
+            the warped portrait, as in the paper.
     """
 
     image_size: int
@@ -40,6 +47,7 @@ class ModelConfig:
     point_embedding_size: int
     unet_sizes: tuple[int, ...]
     unet_unshuffle: int
+    features: Features = "fused"
 
 
 PAPER = ModelConfig(

@@ -16,10 +16,8 @@ from cvthead.model.spiral import SpiralUpsampler
 from cvthead.model.splat import splat
 from cvthead.model.transformer import Transformer
 from cvthead.points import PointLayout
-from cvthead.runtime.place import PLACE_SIZE
+from cvthead.runtime.fill import FILL_LEVELS
 from cvthead.runtime.splat import EMPTY_DEPTH
-
-FILL_LEVELS = 3
 
 
 class CVTHead(nn.Module):
@@ -71,13 +69,20 @@ class CVTHead(nn.Module):
             anchor: (b, shell) vertex that each shell point hangs on.
 
         Returns:
-            (b, p, C + 3) float32: descriptors and each point's place in the portrait.
+            (b, p, C) float32.
         """
         tokens, pixels = self.encoder(source)
-        query = self.vertex_query + vertex_code(points[:, self.coarse], self.config.token_size)
-        x = torch.cat([query, tokens.float() + self.image_code], dim=1)
-        x = self.transformer(x)[:, : len(self.coarse)]
-        vertex = self.upsampler(x)  # b n f
+        if self.config.features == "pixel-aligned":
+            size = self.config.upsampler_sizes[-1]
+            vertex = points.new_zeros(len(points), self.fusion.vertex_embedding.shape[0], size)
+            visible = torch.ones_like(visible)
+        else:
+            query = self.vertex_query + vertex_code(points[:, self.coarse], self.config.token_size)
+            x = torch.cat([query, tokens.float() + self.image_code], dim=1)
+            x = self.transformer(x)[:, : len(self.coarse)]
+            vertex = self.upsampler(x)  # b n f
+            if self.config.features == "transformer":
+                visible = torch.zeros_like(visible)
         embedding = self.fusion.vertex_embedding.expand(len(source), -1, -1)
         feature = self._spread(vertex, anchor)
         embedding = self._spread(embedding, anchor)
@@ -95,19 +100,24 @@ class CVTHead(nn.Module):
         shell = vertex.gather(1, anchor[..., None].expand(-1, -1, vertex.shape[-1]))
         return torch.cat([vertex, middle, shell], dim=1)
 
-    def paint(self, points: Tensor, descriptors: Tensor, warped: Tensor) -> tuple[Tensor, Tensor]:
+    def paint(
+        self, points: Tensor, descriptors: Tensor, seen: Tensor, warped: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Neural vertex rendering (paper section 3.4).
 
         Args:
             points: (b, p, 3) normalised driven projections.
-            descriptors: (b, p, C + 3) from :meth:`describe`.
+            descriptors: (b, p, C) from :meth:`describe`.
+            seen: (b, p) how the portrait sees each point, see cvthead.source.places.
             warped: (b, 4, size, size), the source as given to :meth:`describe`, carried to the
                 driven points (cvthead.runtime.place); size is a multiple of 32.
 
         Returns:
             RGB (b, 3, size, size) in [-1, 1] and mask logits (b, 1, size, size).
         """
-        values = torch.cat([descriptors[..., :-PLACE_SIZE], descriptors[..., -1:]], dim=-1)
+        if self.config.features == "transformer":
+            seen, warped = torch.zeros_like(seen), torch.zeros_like(warped)
+        values = torch.cat([descriptors, seen[..., None]], dim=-1)
         image = splat(points, values, warped.shape[-1] // self.config.unet_unshuffle)
         with torch.autocast(image.device.type, enabled=False):
             filled = self.filled(image)

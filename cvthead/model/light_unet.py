@@ -14,6 +14,16 @@ from cvthead.model.layers import conv_bn_relu, upsample
 PIXEL_SIZE = 8  # channels at full resolution
 PORTRAIT_SIZE = 4  # RGB and mask
 GATE_BIAS = 1.0  # the warped portrait is trusted until training says where not to
+SLOPE = 0.01
+
+
+def clipped(colour: Tensor) -> Tensor:
+    """Colour to [-1, 1], with a slope outside that lets training come back.
+
+    Unlike tanh this leaves grey levels evenly spaced, so an 8-bit network can end with it.
+    """
+    inside = colour.clamp(-1, 1)
+    return inside + SLOPE * (colour - inside)
 
 
 class LightUNet(nn.Module):
@@ -37,6 +47,9 @@ class LightUNet(nn.Module):
             before = size
         self.to_pixels = nn.Conv2d(before, PIXEL_SIZE * unshuffle**2, 3, padding=1)
         self.to_image = nn.Conv2d(PIXEL_SIZE + PORTRAIT_SIZE, 5, 3, padding=1)
+        with torch.no_grad():
+            assert self.to_image.bias is not None
+            self.to_image.bias[4] += GATE_BIAS
 
     def forward(self, splat: Tensor, warped: Tensor) -> tuple[Tensor, Tensor]:
         """Paint a frame.
@@ -50,17 +63,20 @@ class LightUNet(nn.Module):
             mask logits (b, 1, h, w).
         """
         x = self.stem(torch.cat([splat, F.pixel_unshuffle(warped, self.unshuffle)], dim=1))
-        return self.after_stem(x, warped)
+        x = F.pixel_shuffle(self.after_stem(x), self.unshuffle)
+        # 0..1, so that the zeros beyond the border are black and transparent.
+        portrait = torch.cat([warped[:, :3] * 0.5 + 0.5, warped[:, 3:]], dim=1)
+        out = self.to_image(torch.cat([x, portrait.to(x.dtype)], dim=1)).float()
+        gate = torch.sigmoid(out[:, 4:])
+        return gate * warped[:, :3] + (1 - gate) * clipped(out[:, :3]), out[:, 3:4]
 
-    def after_stem(self, x: Tensor, warped: Tensor) -> tuple[Tensor, Tensor]:
-        """The rest of :meth:`forward` from the stem's output (b, sizes[0], h / u, w / u) on."""
+    def after_stem(self, x: Tensor) -> Tensor:
+        """The stem's output (b, sizes[0], h / u, w / u) -> (b, PIXEL_SIZE * u * u, h / u, w / u),
+        the features of each pixel, not yet shuffled to the picture's size."""
         skips = []
         for down in self.downs:
             x = down(x)
             skips.append(x)
         for lateral, up, skip in zip(self.laterals, self.ups, reversed(skips[:-1]), strict=True):
             x = up(torch.cat([upsample(lateral(x)), skip], dim=1))
-        x = F.pixel_shuffle(F.relu(self.to_pixels(x)), self.unshuffle)
-        out = self.to_image(torch.cat([x, warped.to(x.dtype)], dim=1)).float()
-        gate = torch.sigmoid(out[:, 4:] + GATE_BIAS)
-        return gate * warped[:, :3] + (1 - gate) * torch.tanh(out[:, :3]), out[:, 3:4]
+        return F.relu(self.to_pixels(x))

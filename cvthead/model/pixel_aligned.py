@@ -3,8 +3,7 @@
 The paper argues (section 3.3) that features sampled at a vertex's projection are sharp where
 the vertex is visible and wrong where it is not. So they are gated by visibility; hidden points
 see their mirrored counterpart when that is visible, and the transformer's feature always.
-The first three descriptor channels are the point's colour in [-1, 1], the last three say where
-the portrait shows the point.
+The first three descriptor channels are the point's colour in [-1, 1].
 """
 
 from __future__ import annotations
@@ -12,8 +11,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
-
-from cvthead.runtime.place import SEEN, SEEN_MIRRORED
 
 COLOUR_SIZE = 3
 
@@ -59,8 +56,7 @@ class PixelAlignedFusion(nn.Module):
             mirror: (p,) the point's mirrored counterpart.
 
         Returns:
-            (b, p, size + 3): colour, learned channels, then the point's place in the portrait:
-            normalised x and y, and whether the portrait sees it (see cvthead.runtime.place).
+            (b, p, size): colour, then learned channels.
         """
         own = visible[..., None]
         other = own[:, mirror] * (1 - own)
@@ -74,5 +70,4 @@ class PixelAlignedFusion(nn.Module):
         guess = torch.tanh(out[..., :COLOUR_SIZE].float())
         painted = colour + mirrored_colour + (1 - known) * guess
         learned = out[..., COLOUR_SIZE:].float()
-        seen = SEEN * own + SEEN_MIRRORED * other
-        return torch.cat([painted, learned, points[..., :2], seen], dim=-1)
+        return torch.cat([painted, learned], dim=-1)

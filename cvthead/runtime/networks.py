@@ -11,13 +11,13 @@ import onnxruntime as ort
 from numpy.typing import NDArray
 
 from cvthead.deformation import MAX_SHELL_POINTS
+from cvthead.runtime.mix import mix
 from cvthead.runtime.model_folder import DESCRIBE, PAINT, ModelFolder
-from cvthead.runtime.place import PLACE_SIZE, Placed
+from cvthead.runtime.place import Placed, code_size
 from cvthead.runtime.sessions import open_session
+from cvthead.runtime.subpixels import unshuffled
 from cvthead.runtime.threads import cores
 from cvthead.source import Source
-
-Array = NDArray[np.float32]
 
 MAX_THREADS = 4  # more bring nothing at this size
 
@@ -27,17 +27,17 @@ class Networks:
     """Opened sessions; safe to share between threads.
 
     Attributes:
-        describe_session: source -> descriptors.
-        paint_session: splat and warped portrait -> picture.
-        row_size: C + 3, values of a descriptor row.
-        splat_size: height and width of the splat.
+        describe_session: source -> descriptor codes.
+        paint_session: codes of a splat -> codes of a picture.
+        descriptor_size: C.
+        splat_size: height and width of the splat, half of the frame's.
         fingerprint: of the trained weights.
         preset: of the model.
     """
 
     describe_session: ort.InferenceSession
     paint_session: ort.InferenceSession
-    row_size: int
+    descriptor_size: int
     splat_size: int
     fingerprint: str
     preset: str
@@ -57,11 +57,11 @@ class Networks:
         count = threads or min(MAX_THREADS, cores())
         describe, paint = (open_session(folder.read(name), count) for name in (DESCRIBE, PAINT))
         _, size, _, channels = paint.get_inputs()[0].shape
-        row_size = channels - 2 + PLACE_SIZE
-        return cls(describe, paint, row_size, size, folder.fingerprint, folder.preset)
+        descriptors = channels - code_size(0)
+        return cls(describe, paint, descriptors, size, folder.fingerprint, folder.preset)
 
-    def describe(self, source: Source) -> Array:
-        """(P, C + 3) descriptor rows of all points of the layout."""
+    def describe(self, source: Source) -> NDArray[np.uint8]:
+        """(P, C) descriptor codes of all points of the layout."""
         shell = source.deformation.shell_anchor
         anchor = np.zeros((1, MAX_SHELL_POINTS), np.int64)
         anchor[0, : len(shell)] = shell
@@ -71,16 +71,15 @@ class Networks:
             "visible": source.visible[None].astype(np.float32),
             "anchor": anchor,
         }
-        out: Array = self.describe_session.run(None, feed)[0][0]
+        out: NDArray[np.uint8] = self.describe_session.run(None, feed)[0][0]
         return out
 
-    def paint(self, inputs: Sequence[Placed]) -> NDArray[np.uint8]:
-        """(B, 256, 256, 4) RGBA of B frames, which may belong to different avatars."""
-        feed = {
-            "splat": np.stack([one.splat for one in inputs]),
-            "warped": np.stack([one.warped for one in inputs]),
-        }
-        out: NDArray[np.uint8] = self.paint_session.run(None, feed)[0]
-        for rgba, one in zip(out, inputs, strict=True):
-            np.minimum(rgba[..., 3], one.reach, out=rgba[..., 3])
-        return out
+    def paint(self, inputs: Sequence[Placed]) -> list[NDArray[np.uint8]]:
+        """RGBA (256, 256, 4) of each frame; they may belong to different avatars."""
+        codes = np.stack([one.codes for one in inputs])
+        portrait = np.stack([unshuffled(one.warped) for one in inputs])
+        painted = self.paint_session.run(None, {"splat": codes, "portrait": portrait})[0]
+        return [
+            mix(one, placed.warped, placed.reach)
+            for one, placed in zip(painted, inputs, strict=True)
+        ]

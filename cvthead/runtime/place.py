@@ -16,14 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvthead.points import PointLayout
+from cvthead.runtime.fill import FILL_LEVELS, ZERO, fill
 from cvthead.runtime.splat import EMPTY_DEPTH, splat
 from cvthead.runtime.triangles import FAR, rasterise
 from cvthead.runtime.warp import dense_flow, warp
 
 Array = NDArray[np.float32]
+Codes = NDArray[np.uint8]
 
-PLACE_SIZE = 3  # a descriptor row's last values: x and y in the portrait, how it is seen
 SEEN, SEEN_MIRRORED = 1.0, 0.5  # by the portrait; only the point across the face is; else 0
+DEPTH_RANGE = 1.5  # normalised depths of a head in its crop lie well within -1.5..1.5
+CODE_STEPS = 127  # codes of a range on either side of ZERO
 CLOSING = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9))  # closes gaps between points
 SOFT_EDGE = np.ones((3, 3), np.uint8)
 BEHIND = 0.06  # normalised depth, about 10 mm: further back a triangle lies behind the splat
@@ -31,92 +34,116 @@ LARGEST_FLOW = 2.0  # normalised: twice the picture's half width
 
 
 class Placed(NamedTuple):
-    """What the frame network reads, and how far its result may reach.
+    """What the frame network reads, and what its answer is mixed with.
 
     Attributes:
-        splat: (s, s, 1 + C + 1), depth, descriptor and how the portrait sees the point.
-        warped: (size, size, 4) uint8, the portrait carried to the driven pose.
-        reach: (size, size) uint8, highest alpha; see :func:`reach_of`.
+        codes: (s, s, :func:`code_size`) uint8: depth and descriptors with holes filled, how the
+            portrait sees the point, coverage at three scales.
+        warped: (2s, 2s, 4) uint8, the portrait carried to the driven pose.
+        reach: (2s, 2s) uint8, highest alpha; see :func:`reach_of`.
     """
 
-    splat: Array
-    warped: NDArray[np.uint8]
-    reach: NDArray[np.uint8]
+    codes: Codes
+    warped: Codes
+    reach: Codes
+
+
+def code_size(descriptor_size: int) -> int:
+    """Channels of Placed.codes."""
+    return 1 + descriptor_size + 1 + FILL_LEVELS
 
 
 def place(
     layout: PointLayout,
     points: Array,
-    rows: Array,
-    portrait: NDArray[np.uint8],
-    splat_size: int,
+    places: Array,
+    descriptors: Codes,
+    portrait: Codes,
     size: int,
 ) -> Placed:
-    """Splat the rows and carry the portrait's pixels to the driven points.
+    """Splat the descriptors and carry the portrait's pixels to the driven points.
 
     Args:
         layout: numbering of the points.
         points: (P, 3) normalised driven projections.
-        rows: (P, C + 3) descriptor rows; C may be 0.
-        portrait: (256, 256, 4) uint8, see Avatar.
-        splat_size: height and width of the splat.
-        size: of the frame.
+        places: (P, 3) each point's x and y in the portrait and how it is seen.
+        descriptors: (P, C) codes; C may be 0.
+        portrait: (256, 256, 4), see Avatar.
+        size: of the splat, half of the frame's.
     """
-    flowing = rows.copy()
-    flowing[:, -PLACE_SIZE:-1] -= points[:, :2]
-    image = splat(points, flowing, splat_size)
-    seen = (image[..., -1] == SEEN).astype(np.float32)
-    flow = dense_flow(image[..., -PLACE_SIZE:-1], seen, size)
-    _refine(flow, layout, points, rows, image[..., 0])
+    owner = splat(points, size).ravel()
+    drawn = np.flatnonzero(owner >= 0)
+    front = owner[drawn]
+    # Gathered together, for gathering is what costs: flow, seen, depth.
+    table = np.concatenate([places, points[:, 2:]], axis=1)
+    table[:, :2] -= points[:, :2]
+    gathered = table.take(front, axis=0)
+    values = np.zeros((size * size, 1 + descriptors.shape[1]), np.uint8)
+    values[drawn] = np.concatenate(
+        [coded(gathered[:, 3:], DEPTH_RANGE), descriptors.take(front, axis=0)], axis=1
+    )
+    image = np.zeros((size * size, 4), np.float32)
+    image[:, 3] = EMPTY_DEPTH
+    image[drawn] = gathered
+    planes = cv2.split(image.reshape(size, size, 4))
+    x, y, seen, depth = (np.asarray(plane, np.float32) for plane in planes)
+
+    flow = dense_flow(x, y, (seen == SEEN).astype(np.float32), 2 * size)
+    _refine(flow, layout, points, places, depth)
     warped = warp(portrait, flow)
-    kept = np.concatenate([image[..., :-PLACE_SIZE], image[..., -1:]], axis=-1)
-    return Placed(kept, warped, reach_of(image[..., 0], warped))
+    codes = np.empty((size, size, code_size(descriptors.shape[1])), np.uint8)
+    known = depth > EMPTY_DEPTH
+    filled, codes[..., -FILL_LEVELS:] = fill(values.reshape(size, size, -1), known)
+    codes[..., : filled.shape[2]] = filled
+    codes[..., filled.shape[2]] = np.rint(seen * 255)
+    return Placed(codes, warped, reach_of(known, warped))
 
 
-def _refine(flow: Array, layout: PointLayout, points: Array, rows: Array, depth: Array) -> None:
+def coded(values: Array, largest: float) -> Codes:
+    """-largest..largest -> 1..255, 0 -> ZERO."""
+    steps = np.rint(values * np.float32(CODE_STEPS / largest)).clip(-CODE_STEPS, CODE_STEPS)
+    return np.asarray(steps + ZERO, np.uint8)
+
+
+def _refine(flow: Array, layout: PointLayout, points: Array, places: Array, depth: Array) -> None:
     """Replace the flow (size, size, 2) where the face's triangles are in front."""
-    size, count = flow.shape[0], layout.vertices
-    vertices, faces = points[:count], layout.detail_faces
-    faces = faces[(vertices[faces, 2] < FAR).all(axis=1)]
+    size, own = flow.shape[0], layout.detail_vertices
+    corners, faces = points[own], layout.detail_faces
+    away = corners[:, 2] >= FAR
+    if away.any():
+        faces = faces[~away[faces].any(axis=1)]
     if not len(faces):
         return
+    # Every vertex twice: carried from its own place, and from the one across the face.
+    both = np.concatenate([places[own], places[layout.mirror[own]]])
+    both[: len(own), 2] = both[: len(own), 2] == SEEN
+    both[len(own) :, 2] = places[own, 2] == SEEN_MIRRORED
+    clear = both[:, 2][np.stack([faces, faces + len(own)])].sum(axis=2) > 1.5
+    faces = np.where((clear[1] & ~clear[0])[:, None], faces + len(own), faces)
+    corners = np.concatenate([corners, corners])
+    values = both
+    np.clip(both[:, :2] - corners[:, :2], -LARGEST_FLOW, LARGEST_FLOW, out=values[:, :2])
+    values[:, :2] = values[:, :2] * np.float32(0.5 / LARGEST_FLOW) + np.float32(0.5)
+
+    image, front = rasterise(corners, faces, values, size)
     limit = np.where(depth == EMPTY_DEPTH, np.float32(FAR), depth + np.float32(BEHIND))
-    hidden: Array = np.asarray(cv2.resize(limit, (size, size), interpolation=cv2.INTER_NEAREST))
-    places, seen = rows[:count, -PLACE_SIZE:-1], rows[:count, -1]
-
-    taken = _carry(flow, vertices, faces, places, seen == SEEN, hidden)
-    mirrored = seen == SEEN_MIRRORED
-    if mirrored[faces].any():
-        hidden[taken] = -FAR
-        _carry(flow, vertices, faces, places[layout.mirror[:count]], mirrored, hidden)
-
-
-def _carry(
-    flow: Array,
-    vertices: Array,
-    faces: NDArray[np.int32],
-    places: Array,
-    shown: NDArray[np.bool_],
-    hidden: Array,
-) -> NDArray[np.bool_]:
-    """Flow to the vertices' places where shown ones are in front of ``hidden``; returns where."""
-    values = np.empty_like(vertices)
-    values[:, :2] = (places - vertices[:, :2]) / (2 * LARGEST_FLOW) + 0.5
-    values[:, 2] = shown
-    image, front = rasterise(vertices, faces, np.clip(values, 0, 1), flow.shape[0])
-    found = (image[..., 2] > 0.5) & (front < hidden)
-    flow[found] = (image[found, :2] - 0.5) * (2 * LARGEST_FLOW)
-    return np.asarray(found)
+    hidden = cv2.resize(limit, (size, size), interpolation=cv2.INTER_NEAREST)
+    found = (cv2.extractChannel(image, 2) > np.float32(0.5)) & (front < hidden)
+    image -= np.float32(0.5)
+    image *= np.float32(2 * LARGEST_FLOW)
+    carried = np.empty_like(flow)
+    cv2.mixChannels([image], [carried], [0, 0, 1, 1])
+    cv2.copyTo(carried, found.view(np.uint8), flow)
 
 
-def reach_of(depth: Array, warped: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(size, size) uint8: 255 where points lie or the carried portrait shows the person.
+def reach_of(known: NDArray[np.bool_], warped: Codes) -> Codes:
+    """(2s, 2s) uint8: 255 where points lie (s, s) or the carried portrait shows the person.
 
     Beyond the edge of a portrait nothing is known. Training pictures end there as well, so the
     network was never told to leave it empty.
     """
-    drawn = (depth > EMPTY_DEPTH).astype(np.uint8) * 255
-    closed = cv2.morphologyEx(drawn, cv2.MORPH_CLOSE, CLOSING)
+    closed = cv2.morphologyEx(known.view(np.uint8) * 255, cv2.MORPH_CLOSE, CLOSING)
     size = warped.shape[0]
     points = cv2.resize(closed, (size, size), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(np.maximum(points, cv2.dilate(warped[..., 3], SOFT_EDGE)), np.uint8)
+    person = cv2.dilate(cv2.extractChannel(warped, 3), SOFT_EDGE)
+    return np.asarray(cv2.max(points, person), np.uint8)

@@ -7,22 +7,22 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float32]
 
+EMPTY = -1
 EMPTY_DEPTH = -2.0
 BLOCK = 4  # pixels; wide enough that the points of the front surface leave no block empty
 FRONT = 0.15  # thickness of the front surface in normalised depth, about 25 mm
 
 
-def splat(points: Array, rows: Array, size: int) -> Array:
-    """Front points' depth and rows as an image (paper section 3.4).
+def splat(points: Array, size: int) -> NDArray[np.int64]:
+    """The front point at each pixel (paper section 3.4).
 
     Args:
         points: (P, 3) normalised driven projections.
-        rows: (P, C) values of each point.
-        size: image height and width.
+        size: image height and width, a multiple of BLOCK.
 
     Returns:
-        (size, size, 1 + C): depth first (-2 where empty), then the nearest point's row (0 where
-        empty). Of points at equal depth the one with the higher number wins.
+        (size, size) point number, -1 where empty. Of points at equal depth the one with the
+        higher number wins.
     """
     x, y, depth = np.ascontiguousarray(points.T)
     column, row = _pixel(x, size), _pixel(y, size)
@@ -34,15 +34,9 @@ def splat(points: Array, rows: Array, size: int) -> Array:
     front = np.nonzero(depth <= nearest[block] + np.float32(FRONT))[0]
     # Farthest first, so that the last writer of a pixel is the nearest point.
     front = front[np.argsort(-depth[front], kind="stable")]
-    pixel = row[front] * size + column[front]
-    owner = np.full(size * size, -1, np.int64)
-    owner[pixel] = inside[front]
-    image = np.zeros((size * size, 1 + rows.shape[1]), np.float32)
-    image[:, 0] = EMPTY_DEPTH
-    drawn = np.nonzero(owner >= 0)[0]
-    image[drawn, 0] = points[owner[drawn], 2]
-    image[drawn, 1:] = rows[owner[drawn]]
-    return image.reshape(size, size, -1)
+    owner = np.full(size * size, EMPTY, np.int64)
+    owner[row[front] * size + column[front]] = inside[front]
+    return owner.reshape(size, size)
 
 
 def _pixel(coordinate: Array, size: int) -> NDArray[np.int64]:

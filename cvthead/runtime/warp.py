@@ -11,27 +11,38 @@ Array = NDArray[np.float32]
 
 FLOW_LEVELS = 4
 EPSILON = 1e-4
-THREE = np.ones((3, 3), np.uint8)
 
 
-def dense_flow(flow: Array, seen: Array, size: int) -> Array:
-    """Splatted flow (s, s, 2), valid where seen (s, s) is 1 -> (size, size, 2), no holes."""
-    weighted = np.dstack([flow * seen[..., None], seen])
-    smooth = cv2.blur(weighted, (3, 3), borderType=cv2.BORDER_CONSTANT)
-    share = np.maximum(smooth[..., 2:], EPSILON)
-    near = cv2.dilate(seen, THREE, borderType=cv2.BORDER_CONSTANT, borderValue=0)[..., None]
-    levels = [np.concatenate([smooth[..., :2] / share * near, near], axis=-1)]
+def dense_flow(x: Array, y: Array, seen: Array, size: int) -> Array:
+    """Splatted flow x and y (s, s), valid where seen (s, s) is 1 -> (size, size, 2), no holes."""
+    weighted = cv2.merge([x * seen, y * seen, seen])
+    # Averages of what is known among nine pixels; the third channel becomes 1 where anything is.
+    near: Array = np.asarray(cv2.blur(weighted, (3, 3), borderType=cv2.BORDER_CONSTANT))
+    levels = [_means(near)]
+    pulled = levels[0]
     for _ in range(FLOW_LEVELS):
-        half = levels[-1].shape[0] // 2
-        levels.append(
-            np.asarray(cv2.resize(levels[-1], (half, half), interpolation=cv2.INTER_AREA))
-        )
-    dense = levels[-1][..., :2] / np.maximum(levels[-1][..., 2:], EPSILON)
+        half = pulled.shape[0] // 2
+        pulled = np.asarray(cv2.resize(pulled, (half, half), interpolation=cv2.INTER_AREA))
+        levels.append(pulled)
+    dense = _means(levels[-1])
     for level in reversed(levels[:-1]):
-        coarse = cv2.resize(dense, level.shape[:2], interpolation=cv2.INTER_LINEAR)
-        known = level[..., :2] / np.maximum(level[..., 2:], EPSILON)
-        dense = np.where(level[..., 2:] > 0, known, coarse)
-    return np.asarray(cv2.resize(dense, (size, size), interpolation=cv2.INTER_LINEAR), np.float32)
+        known = _means(level)
+        side = level.shape[0]
+        coarse = np.asarray(cv2.resize(dense, (side, side), interpolation=cv2.INTER_LINEAR))
+        some = (cv2.extractChannel(level, 2) > 0).view(np.uint8)
+        dense = np.asarray(cv2.copyTo(known, some, coarse))
+    out = np.empty((size, size, 2), np.float32)
+    full = np.asarray(cv2.resize(dense, (size, size), interpolation=cv2.INTER_LINEAR))
+    cv2.mixChannels([full], [out], [0, 0, 1, 1])
+    return out
+
+
+def _means(sums: Array) -> Array:
+    """(s, s, 3) weighted x and y and weight -> x, y, and 1 where the weight is above 0."""
+    x, y, weight = cv2.split(sums)
+    share = np.maximum(weight, np.float32(EPSILON))
+    some = (weight > 0).astype(np.float32)
+    return np.asarray(cv2.merge([x / share, y / share, some]))
 
 
 def warp(portrait: NDArray[np.uint8], flow: Array) -> NDArray[np.uint8]:

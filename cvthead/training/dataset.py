@@ -6,7 +6,6 @@ mirrored face, seen from the other side, is what the hidden half should look lik
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,15 +17,21 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from cvthead.deformation import MAX_SHELL_POINTS
+from cvthead.deformation import MAX_SHELL_POINTS, Deformation
 from cvthead.driving import at_neck
 from cvthead.head.model import HeadModel
 from cvthead.model.config import OPEN
 from cvthead.points import FAR_AWAY, PointLayout
-from cvthead.runtime.place import SEEN, SEEN_MIRRORED, place
-from cvthead.source import as_network_input, driven_points, network_input, portrait_pixels
+from cvthead.runtime.place import place
+from cvthead.source import (
+    as_network_input,
+    driven_points,
+    network_input,
+    places,
+    portrait_pixels,
+)
 from cvthead.training.details import ZOOMED, detail_weights, zoom_corner
-from cvthead.training.records import Frame, Record
+from cvthead.training.records import Frame, stored_records
 from cvthead.visibility import inside_mask, on_person
 
 Array = NDArray[np.float32]
@@ -60,16 +65,23 @@ class PairDataset(Dataset[dict[str, Tensor]]):
         size: int,
         seed: int,
         samples: int,
+        deform: bool = True,
     ) -> None:
+        """Args:
+        folder: records of cvthead.data, see cvthead.training.records.
+        size: of the driven views, pixels.
+        samples: length.
+        deform: False leaves the heads bald: the ablation without deformation.
+
+        Raises:
+            InputError: no records in the folder.
+        """
+        self.deform = deform
         self.head, self.layout = head, layout
         self.size, self.seed, self.samples = size, seed, samples
-        self.clips: list[Path] = []
-        self.stills: list[Path] = []
-        for path in sorted(folder.glob("*.npz")):
-            with np.load(path, allow_pickle=False) as archive:
-                (self.clips if len(archive["pose"]) > 1 else self.stills).append(path)
-        if not self.clips and not self.stills:
-            raise FileNotFoundError(f"no records in {folder}; run cvthead.training.prepare first")
+        stored = stored_records(folder)
+        self.clips = [record for record in stored if record.frames > 1]
+        self.stills = [record for record in stored if record.frames == 1]
 
     def __len__(self) -> int:
         return self.samples
@@ -78,11 +90,11 @@ class PairDataset(Dataset[dict[str, Tensor]]):
         cv2.setNumThreads(1)
         rng = np.random.default_rng((self.seed, index))
         use_clip = bool(self.clips) and (not self.stills or rng.random() < CLIP_SHARE)
-        files: Sequence[Path] = self.clips if use_clip else self.stills
-        record = Record.open(files[int(rng.integers(len(files)))])
+        among = self.clips if use_clip else self.stills
+        record = among[int(rng.integers(len(among)))].open()
         number = int(rng.choice(record.sources))
         source = record.frame(number)
-        deformation = record.deformation(number)
+        deformation = record.deformation(number) if self.deform else Deformation.none(self.head)
         visible = record.visible(number, self.layout.total).astype(np.float32)
         anchor = np.zeros(MAX_SHELL_POINTS, dtype=np.int64)
         anchor[: len(deformation.shell_anchor)] = deformation.shell_anchor
@@ -119,13 +131,14 @@ class PairDataset(Dataset[dict[str, Tensor]]):
             views = [mirrored(v, self.layout) for v in views]
         driven = [np.where(drawn[:, None], v.points, FAR_AWAY) for v in views]
         landmarks = [self.head.landmarks(v.points[: self.layout.vertices]) for v in views]
-        rows = np.concatenate([own[:, :2], self._seen(visible)[:, None]], axis=1)
+        at = places(self.layout, own, visible > 0)
         portrait = portrait_pixels(network)
         zoomed = int(rng.integers(len(ZOOMED)))
         stack: dict[str, NDArray[Any]] = {
             "source": network,
             "points": own,
             "visible": visible,
+            "seen": at[:, 2],
             "anchor": anchor,
             "window": rng.random(3),
             "zoom": np.array([zoom_corner(each, zoomed, self.size) for each in landmarks]),
@@ -135,7 +148,7 @@ class PairDataset(Dataset[dict[str, Tensor]]):
             "mask": np.stack([self._resized(v.mask)[None] for v in views]),
             "valid": np.stack([self._resized(v.valid)[None] > 0.99 for v in views]),
             "driven": np.stack(driven),
-            "warped": np.stack([self._warped(each, rows, portrait) for each in driven]),
+            "warped": np.stack([self._warped(each, at, portrait) for each in driven]),
         }
         return {
             name: torch.from_numpy(
@@ -144,16 +157,11 @@ class PairDataset(Dataset[dict[str, Tensor]]):
             for name, value in stack.items()
         }
 
-    def _seen(self, visible: Array) -> Array:
-        """(P,) how the portrait sees each point, see cvthead.runtime.place."""
-        across = np.zeros_like(visible)
-        across[: self.layout.surface] = visible[self.layout.mirror]
-        return SEEN * visible + SEEN_MIRRORED * across * (1 - visible)
-
-    def _warped(self, driven: Array, rows: Array, portrait: NDArray[np.uint8]) -> Array:
+    def _warped(self, driven: Array, at: Array, portrait: NDArray[np.uint8]) -> Array:
         """(4, S, S) portrait carried to the driven points, as a network input."""
         splat_size = self.size // OPEN.unet_unshuffle
-        placed = place(self.layout, driven, rows, portrait, splat_size, self.size)
+        nothing = np.empty((len(driven), 0), np.uint8)
+        placed = place(self.layout, driven, at, nothing, portrait, splat_size)
         return as_network_input(placed.warped)
 
     def _resized(self, image: Array) -> Array:

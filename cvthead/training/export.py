@@ -9,13 +9,18 @@ networks ``describe.onnx`` and ``paint.onnx`` made from it, and ``model.json``.
 from __future__ import annotations
 
 import argparse
-import hashlib
 import tempfile
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+import onnx
 import onnxruntime as ort
 import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
 from cvthead import weights
 from cvthead.camera import CROP_PIXELS
@@ -25,25 +30,19 @@ from cvthead.model.config import OPEN
 from cvthead.model.cvthead import CVTHead
 from cvthead.points import PointLayout
 from cvthead.runtime.model_folder import DESCRIBE, PAINT, WEIGHTS, write_record
-from cvthead.runtime.place import place
-from cvthead.source import portrait_pixels
+from cvthead.runtime.place import Placed, place
+from cvthead.source import places, portrait_pixels
 from cvthead.training.dataset import PairDataset
 from cvthead.training.onnx_export import export_describe, export_paint
-from cvthead.training.quantise import Feed, quantise
+from cvthead.training.quantise import feed, quantise
+from cvthead.training.records import records_hash
 
 CALIBRATION, HELD_OUT = 32, 16
 SPLAT_SIZE = CROP_PIXELS // OPEN.unet_unshuffle
 DESCRIBE_INPUTS = ("source", "points", "visible", "anchor")
 SEED = 2  # of the calibration samples
-
-
-def records_hash(folder: Path) -> str:
-    """SHA-256 over names and contents of the training records."""
-    digest = hashlib.sha256()
-    for path in sorted(folder.glob("*.npz")):
-        digest.update(path.name.encode())
-        digest.update(path.read_bytes())
-    return digest.hexdigest()
+DESCRIPTOR_SHARE = 0.9999  # the rest is clipped to the largest code
+FEATURE_SHARE = 0.9999
 
 
 def averaged_model(checkpoint: Path) -> tuple[CVTHead, int]:
@@ -59,21 +58,51 @@ def averaged_model(checkpoint: Path) -> tuple[CVTHead, int]:
     return model, state["step"]
 
 
-def frame_inputs(describe: Path, records: Path, count: int) -> list[Feed]:
-    """Inputs of the frame network for driven views of training records."""
+def samples(records: Path, count: int) -> tuple[PointLayout, list[dict[str, NDArray[Any]]]]:
+    """Training samples to calibrate on."""
     head = HeadModel.load()
     layout = PointLayout.of(head)
     dataset = PairDataset(records, head, layout, size=CROP_PIXELS, seed=SEED, samples=count)
+    batches = (dataset[index] for index in range(count))
+    return layout, [{name: value.numpy() for name, value in b.items()} for b in batches]
+
+
+def descriptor_range(model: CVTHead, calibration: Sequence[dict[str, NDArray[Any]]]) -> Tensor:
+    """(C,) absolute value that nearly all descriptors stay below."""
+    with torch.inference_mode():
+        rows = [
+            model.describe(*(torch.from_numpy(sample[n])[None] for n in DESCRIBE_INPUTS))[0]
+            for sample in calibration
+        ]
+    largest = np.quantile(torch.cat(rows).abs().numpy(), DESCRIPTOR_SHARE, axis=0)
+    return torch.from_numpy(np.maximum(largest, 1e-3).astype(np.float32))
+
+
+def frames(
+    describe: Path, layout: PointLayout, calibration: Sequence[dict[str, NDArray[Any]]]
+) -> list[Placed]:
+    """Inputs of the frame network: a driven view of each sample."""
     session = ort.InferenceSession(str(describe), providers=["CPUExecutionProvider"])
-    feeds: list[Feed] = []
-    for index in range(count):
-        sample = {name: value.numpy() for name, value in dataset[index].items()}
-        inputs = {name: sample[name][None] for name in DESCRIBE_INPUTS}
-        rows = session.run(None, inputs)[0][0]
+    out = []
+    for sample in calibration:
+        codes = session.run(None, {name: sample[name][None] for name in DESCRIBE_INPUTS})[0][0]
+        at = places(layout, sample["points"], sample["visible"] > 0)
         portrait = portrait_pixels(sample["source"])
-        placed = place(layout, sample["driven"][0], rows, portrait, SPLAT_SIZE, CROP_PIXELS)
-        feeds.append({"splat": placed.splat[None], "warped": placed.warped[None]})
-    return feeds
+        out.append(place(layout, sample["driven"][0], at, codes, portrait, SPLAT_SIZE))
+    return out
+
+
+def feature_range(network: Path, placed: Sequence[Placed]) -> float:
+    """Largest of the last features of a frame network exported with range 1."""
+    network_with = onnx.load(str(network))
+    last = [node for node in network_with.graph.node if node.op_type == "Concat"][-1]
+    name = last.input[0]
+    network_with.graph.output.append(onnx.ValueInfoProto(name=name))
+    session = ort.InferenceSession(
+        network_with.SerializeToString(), providers=["CPUExecutionProvider"]
+    )
+    largest = [np.quantile(session.run([name], feed(each))[0], FEATURE_SHARE) for each in placed]
+    return float(np.max(largest)) / 255
 
 
 def export(checkpoint: Path, output: Path, records: Path) -> dict[str, str]:
@@ -95,12 +124,15 @@ def export(checkpoint: Path, output: Path, records: Path) -> dict[str, str]:
     # The networks are made of the weights as stored, in half precision.
     fingerprint = weights.load_into(model, output / WEIGHTS)
     model.eval().requires_grad_(False)
-    export_describe(model, output / DESCRIBE)
+    layout, calibration = samples(records, CALIBRATION + HELD_OUT)
+    largest = descriptor_range(model, calibration[:CALIBRATION])
+    export_describe(model, largest, output / DESCRIBE)
+    placed = frames(output / DESCRIBE, layout, calibration)
     with tempfile.TemporaryDirectory() as folder:
         exact = Path(folder) / PAINT
-        export_paint(model, exact)
-        feeds = frame_inputs(output / DESCRIBE, records, CALIBRATION + HELD_OUT)
-        decibels = quantise(exact, output / PAINT, feeds[:CALIBRATION], feeds[CALIBRATION:])
+        export_paint(model, largest, 1.0, exact)
+        export_paint(model, largest, feature_range(exact, placed[:CALIBRATION]), exact)
+        decibels = quantise(exact, output / PAINT, placed[:CALIBRATION], placed[CALIBRATION:])
     training["quantisation_psnr"] = f"{decibels:.1f} dB"
     write_record(output, "open", fingerprint, training)
     return training

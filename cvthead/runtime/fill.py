@@ -1,0 +1,51 @@
+"""Holes of a splat, filled as cvthead/model/fill.py does, on 8-bit codes."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Codes = NDArray[np.uint8]
+Array = NDArray[np.float32]
+
+FILL_LEVELS = 3
+ZERO = 128  # the code of 0
+
+
+def fill(values: Codes, known: NDArray[np.bool_]) -> tuple[Codes, Codes]:
+    """A hole takes the average of what its 2, 4, 8 pixel block knows, or ZERO.
+
+    Args:
+        values: (s, s, C) codes, 0 where not known; s is a multiple of 8.
+        known: (s, s).
+
+    Returns:
+        Filled (s, s, C), and the coverage of each level's blocks (s, s, 3), 0..255.
+    """
+    size = known.shape[0]
+    total, count = values.astype(np.uint16), known.astype(np.uint16)
+    pulled: list[tuple[Array, NDArray[np.bool_]]] = []
+    coverage = np.empty((size, size, FILL_LEVELS), np.uint8)
+    for level in range(FILL_LEVELS):
+        total, count = _quarters(total), _quarters(count)
+        share = np.rint(count * np.float32(255 / 4 ** (level + 1))).astype(np.uint8)
+        coverage[..., level] = cv2.resize(share, (size, size), interpolation=cv2.INTER_LINEAR)
+        share_inverse = np.reciprocal(np.maximum(count, 1).astype(np.float32))
+        mean: Array = np.asarray(total * share_inverse[..., None], np.float32)
+        pulled.append((mean, (count > 0)[..., None]))
+    out = np.full_like(mean, ZERO)
+    for mean, some in reversed(pulled):
+        coarse = cv2.resize(out, mean.shape[:2], interpolation=cv2.INTER_LINEAR)
+        out = np.where(some, mean, coarse.reshape(mean.shape))
+    small = np.rint(out).astype(np.uint8)
+    large = cv2.resize(small, (size, size), interpolation=cv2.INTER_LINEAR)
+    filled = large.reshape(values.shape).astype(np.uint8, copy=False)
+    filled[known] = values[known]
+    return filled, coverage
+
+
+def _quarters(a: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    """Sums over blocks of two by two; 64 codes fit in 16 bits."""
+    rows = a[::2] + a[1::2]
+    return np.asarray(rows[:, ::2] + rows[:, 1::2])

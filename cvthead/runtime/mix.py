@@ -1,0 +1,38 @@
+"""The frame network's codes -> the picture: warped pixels and painted ones, mixed by its gate."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cvthead.runtime.subpixels import shuffled
+
+Codes = NDArray[np.uint8]
+
+PAINTED = 16  # channels: RGB and mask of each of a block's pixels, then the gates
+# The network gives mask and gate as logits in -LOGIT_RANGE..LOGIT_RANGE.
+LOGIT_RANGE = 8.0
+SIGMOID = np.reciprocal(1 + np.exp(LOGIT_RANGE * (1 - np.arange(256) / 127.5)))
+ALPHA = np.rint(255 * SIGMOID).astype(np.uint8)
+GATE = SIGMOID.astype(np.float32)
+
+
+def mix(codes: Codes, warped: Codes, reach: Codes) -> Codes:
+    """One frame.
+
+    Args:
+        codes: (s, s, 20) of the network.
+        warped: (2s, 2s, 4) the portrait carried to the pose.
+        reach: (2s, 2s) highest alpha.
+
+    Returns:
+        (2s, 2s, 4) RGBA.
+    """
+    blocks = np.ascontiguousarray(codes[..., :PAINTED]).view(np.uint32)
+    painted = shuffled(blocks).view(np.uint8).reshape(warped.shape)
+    gate = cv2.LUT(shuffled(codes[..., PAINTED:]), GATE)  # type: ignore[arg-type]
+    out = cv2.blendLinear(warped, painted, gate, 1 - gate)
+    alpha = cv2.min(cv2.LUT(cv2.extractChannel(painted, 3), ALPHA), reach)
+    cv2.insertChannel(alpha, out, 3)
+    return np.asarray(out, np.uint8)
