@@ -74,9 +74,10 @@ class PointLayout:
         shell = points[self.vertices :]
         out = np.empty((self.total, 3), dtype=np.float32)
         out[: self.vertices] = vertices
-        out[self.vertices : self.surface] = (
-            vertices[self.edges[:, 0]] + vertices[self.edges[:, 1]]
-        ) * np.float32(0.5)
+        middle = out[self.vertices : self.surface]
+        one, other = (vertices.take(end, axis=0) for end in self.edges.T)
+        np.add(one, other, out=middle)
+        middle *= np.float32(0.5)
         out[self.surface : self.surface + len(shell)] = shell
         out[self.surface + len(shell) :] = FAR_AWAY
         return out

@@ -84,7 +84,10 @@ def test_fill_is_the_one_the_network_was_trained_with() -> None:
     expected, shares = torch_fill(values, weight, FILL_LEVELS)
     filled, coverage = fill(np.where(known[..., None], codes, np.uint8(0)), known)
     # Two roundings to codes.
-    assert np.abs(filled.astype(np.float32) - ZERO - expected[0].permute(1, 2, 0).numpy()).max() <= 1.05
+    assert (
+        np.abs(filled.astype(np.float32) - ZERO - expected[0].permute(1, 2, 0).numpy()).max()
+        <= 1.05
+    )
     for level, share in enumerate(shares):
         assert np.abs(coverage[..., level] / 255 - share[0, 0].numpy()).max() < 0.005
 
