@@ -1,26 +1,39 @@
-"""The training loop on a record of the sample portrait."""
+"""Training on records of the sample portrait: samples, resuming, configurations."""
 
 from __future__ import annotations
 
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from made_records import make_records, portrait_crop
 
+from cvthead.cli.main import main
 from cvthead.deformation import DeformationModel
-from cvthead.errors import AssetError
+from cvthead.errors import AssetError, InputError
 from cvthead.head.model import HeadModel
-from cvthead.images import read_image
 from cvthead.points import PointLayout
-from cvthead.source import cut_head, read_source
+from cvthead.source import read_source
 from cvthead.tracking.tracker import Tracker
 from cvthead.training import records
+from cvthead.training.config import TrainConfig, load_config
 from cvthead.training.dataset import PairDataset, flip_order, flip_points
 from cvthead.training.perceptual import perceptual_weights
-from cvthead.training.train import TrainConfig, train
+from cvthead.training.train import train
 
-PORTRAIT = Path(__file__).parents[1] / "examples" / "astronaut.png"
+# Of a resumed run's losses; the sums' order in a thread pool is all that may differ.
+TOLERANCE = 1e-4
+
+LEARNT = 0.9  # of the first step's losses, after 40
 
 
 @pytest.fixture(scope="module")
@@ -34,18 +47,71 @@ def layout(head: HeadModel) -> PointLayout:
 
 
 @pytest.fixture(scope="module")
-def folder(head: HeadModel, layout: PointLayout, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("records")
-    tracker = Tracker.load(head)
-    image = read_image(PORTRAIT)
-    crop = cut_head(tracker, image, tracker.track(image))
+    make_records(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def _perceptual() -> None:
+    try:
+        perceptual_weights("alex")
+    except AssetError as error:
+        pytest.skip(f"no perceptual weights: {error}")
+
+
+@pytest.fixture(autouse=True)
+def _one_thread(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Pictures this small gain nothing from a second thread."""
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def small(folder: Path, run: Path, **changes: Any) -> dict[str, Any]:
+    """A configuration that runs in seconds."""
+    values = {
+        "data": str(folder),
+        "run": str(run),
+        "size": 64,
+        "steps": 4,
+        "batch": 1,
+        "workers": 0,
+        "log_every": 1,
+        "save_every": 2,
+        "average": 0.9,
+    }
+    return values | changes
+
+
+def log_of(run: Path) -> list[dict[str, float]]:
+    return [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
+
+
+def assert_same_curve(one: Path, other: Path) -> None:
+    """The losses of two runs agree step by step within TOLERANCE."""
+    first, second = log_of(one), log_of(other)
+    assert [line["step"] for line in first] == [line["step"] for line in second]
+    for a, b in zip(first, second, strict=True):
+        assert a.keys() == b.keys()
+        for name in a.keys() - {"seconds_per_step"}:
+            assert a[name] == pytest.approx(b[name], rel=TOLERANCE), (name, a["step"])
+
+
+def test_a_record_keeps_what_was_tracked(
+    head: HeadModel, layout: PointLayout, tmp_path: Path
+) -> None:
+    crop = portrait_crop(Tracker.load(head))
     source = read_source(DeformationModel.from_head(head), layout, crop)
-    records.write(path / "portrait.npz", [crop], {0: source})
-    stored = records.Record.open(path / "portrait.npz")
+    records.write(tmp_path / "portrait.npz", [crop], {0: source})
+    (where,) = records.stored_records(tmp_path)
+    stored = where.open()
     assert np.array_equal(stored.visible(0, layout.total), source.visible)
     assert np.allclose(stored.deformation(0).offsets, source.deformation.offsets, atol=1e-4)
     assert np.abs(stored.frame(0).image.astype(int) - crop.image).mean() < 3
-    return path
 
 
 def test_a_sample_depends_on_seed_and_number_alone(
@@ -59,6 +125,19 @@ def test_a_sample_depends_on_seed_and_number_alone(
     assert not torch.equal(first["source"], other["source"])
 
 
+def test_without_deformation_no_shell_is_drawn(
+    folder: Path, head: HeadModel, layout: PointLayout
+) -> None:
+    haired, bald = (
+        PairDataset(folder, head, layout, size=64, seed=1, samples=8, deform=deform)[3]
+        for deform in (True, False)
+    )
+    shell = slice(layout.surface, None)
+    assert (haired["driven"][:, shell, 0] > -2).any()
+    assert not (bald["driven"][:, shell, 0] > -2).any()
+    assert torch.equal(haired["image"], bald["image"])
+
+
 def test_flip_is_its_own_inverse(layout: PointLayout) -> None:
     rng = np.random.default_rng(0)
     points = rng.normal(size=(layout.total, 3)).astype(np.float32)
@@ -66,19 +145,110 @@ def test_flip_is_its_own_inverse(layout: PointLayout) -> None:
     assert not np.array_equal(flip_order(points, layout), points)
 
 
+@pytest.mark.usefixtures("_perceptual")
 def test_resumed_run_equals_one_without_a_break(folder: Path, tmp_path: Path) -> None:
-    try:
-        perceptual_weights("alex")
-    except AssetError as error:
-        pytest.skip(f"no perceptual weights: {error}")
-    config = TrainConfig(size=64, steps=4, batch=1, learning_rate=1e-3, freeze_norm=0.5)
     whole, parts = tmp_path / "whole", tmp_path / "parts"
-    train(config, folder, whole)
-    train(config, folder, parts, sitting=2)
+    changes = {"freeze_norm": 0.5, "precision": "32-true"}
+    train(TrainConfig(**small(folder, whole, **changes)))
+    config = TrainConfig(**small(folder, parts, **changes))
+    train(config, sitting=2)
     assert torch.load(parts / "checkpoint.pt", weights_only=True)["step"] == 2
-    train(config, folder, parts)
+    train(config)
     states = [torch.load(run / "checkpoint.pt", weights_only=True) for run in (whole, parts)]
     assert states[0]["step"] == states[1]["step"] == 4
     for name, value in states[0]["averaged"].items():
         torch.testing.assert_close(states[1]["averaged"][name], value, rtol=1e-4, atol=1e-5)
+    assert_same_curve(whole, parts)
     assert (parts / "samples.png").is_file()
+    assert list((parts / "tensorboard").glob("events.*"))
+    with pytest.raises(InputError, match="other settings: steps"):
+        train(TrainConfig(**small(folder, parts, **changes | {"steps": 9})))
+
+
+@pytest.mark.usefixtures("_perceptual")
+def test_two_processes_resume_after_a_kill(folder: Path, tmp_path: Path) -> None:
+    """The same run twice under torchrun: straight, and killed after step 3 of 4, which goes on
+    from step 2."""
+    changes = {"batch": 2, "steps": 4, "precision": "32-true", "workers": 1}
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    run_two(small(folder, whole, **changes), tmp_path)
+    run_two(small(folder, broken, **changes), tmp_path, kill_after=3)
+    assert torch.load(broken / "checkpoint.pt", weights_only=True)["step"] == 2
+    run_two(small(folder, broken, **changes), tmp_path)
+    assert torch.load(broken / "checkpoint.pt", weights_only=True)["step"] == 4
+    assert_same_curve(whole, broken)
+
+
+def run_two(values: dict[str, Any], folder: Path, kill_after: int | None = None) -> None:
+    """Two training processes; with ``kill_after``, both are killed once that step is logged."""
+    config = folder / "config.toml"
+    config.write_text("\n".join(f"{key} = {json.dumps(value)}" for key, value in values.items()))
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
+    command += ["--nproc-per-node", "2", "-m", "cvthead.cli.main", "train", str(config)]
+    log = Path(values["run"]) / "log.jsonl"
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as process:
+        if kill_after is not None:
+            while process.poll() is None and not (
+                log.exists() and len(log.read_text().splitlines()) >= kill_after
+            ):
+                time.sleep(0.02)
+            for worker in (
+                Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+            ):
+                os.kill(int(worker), signal.SIGKILL)
+        output, _ = process.communicate()
+    assert (process.returncode == 0) == (kill_after is None), output
+
+
+@pytest.mark.usefixtures("_perceptual")
+def test_a_portrait_is_learnt(folder: Path, tmp_path: Path) -> None:
+    """The short version of tests/nightly/test_overfit.py: the smoothed losses fall
+    below LEARNT of their start."""
+    optimiser = {"name": "adamw", "learning_rate": 2e-3, "warm_up": 5, "clip_norm": 1.0}
+    weights = {"perceptual": 0.5}
+    config = small(folder, tmp_path, steps=40, save_every=40, losses=weights, optimiser=optimiser)
+    train(TrainConfig(**config, precision="32-true"))
+    curve = log_of(tmp_path)
+    for name in ("l1", "perceptual", "dice"):
+        assert curve[-1][name] < LEARNT * curve[0][name], name
+
+
+def test_shipped_configurations_are_valid() -> None:
+    fine = load_config("finetune", {"data": Path("d")})
+    assert fine.init == "shipped"
+    assert fine.data == Path("d")
+    assert load_config("open.toml", {}).optimiser.betas == (0.9, 0.99)
+    assert load_config("paper", {}).batch == 16
+    assert load_config("paper-stage2", {}).stage == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("steps = 'many'", "steps: "),
+        ("steps = 3\nspeed = 2", "speed: "),
+        ("steps = 3\nsize = 100", "size: "),
+        ("steps = 3\nstage = 2", "losses.adversarial"),
+        ("steps = 3\n[losses]\nidentity = 0.1", "networks.identity"),
+        ("steps = ", "not TOML"),
+    ],
+)
+def test_a_wrong_configuration_costs_one_line(
+    text: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "c.toml").write_text(text)
+    assert main(["train", str(tmp_path / "c.toml")]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_missing_records_and_weights_are_named(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["train", "open", "--data", str(tmp_path)]) == 2
+    assert "no records" in capsys.readouterr().err
+    assert main(["train", "paper", "--data", str(folder)]) == 2
+    assert "vgg19.pth" in capsys.readouterr().err

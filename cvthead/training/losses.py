@@ -1,25 +1,15 @@
-"""Reconstruction losses of the plain training loop (paper section 3.5 without the adversary)."""
+"""Reconstruction losses (paper section 3.5): of the open preset, and as the paper has them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from cvthead.training.details import ZOOM_SIDE
-from cvthead.training.perceptual import STLPIPS
 
 WINDOW = 0.75  # side, as a share of the view's
 ZOOM_SHARE = 0.4  # of the steps, whose perceptual loss sees enlarged eyes or mouths
-
-
-@dataclass(frozen=True)
-class LossWeights:
-    l1: float = 1.0
-    perceptual: float = 4.0
-    dice: float = 0.3
 
 
 def window(place: Tensor, size: int) -> tuple[slice, slice]:
@@ -50,7 +40,7 @@ def composite(rgb: Tensor, mask: Tensor, background: Tensor) -> Tensor:
 
 
 def reconstruction_losses(
-    rgb: Tensor, logits: Tensor, batch: dict[str, Tensor], perceptual: STLPIPS
+    rgb: Tensor, logits: Tensor, batch: dict[str, Tensor], perceptual: nn.Module
 ) -> dict[str, Tensor]:
     """Losses of rendered views against the driven frames.
 
@@ -59,7 +49,7 @@ def reconstruction_losses(
         batch: image (b, 3, s, s) in 0..1, mask and valid (b, 1, s, s), background (b, 3, 1, 1),
             weight (b, 1, s, s) of each pixel; zoom (b, 2), see :func:`zoomed`; window (b, 3) in
             0..1: the first decides for all where the perceptual loss looks.
-        perceptual: frozen distance network.
+        perceptual: frozen distance network, (b, 3, h, w) twice -> (b,).
 
     Returns:
         Scalars l1, perceptual and dice. Pixels beyond the driven picture count nowhere.
@@ -81,10 +71,47 @@ def reconstruction_losses(
     else:
         rows, columns = window(place, rgb.shape[-1])
         shown, compared = shown[..., rows, columns], target[..., rows, columns]
-    overlap = (mask * target_mask * valid).sum()
-    sizes = ((mask.square() + target_mask.square()) * valid).sum()
     return {
         "l1": l1,
         "perceptual": perceptual(shown, compared).float().mean(),
-        "dice": 1 - 2 * overlap / sizes.clamp(min=1),
+        "dice": dice(mask, target_mask, valid),
     }
+
+
+def paper_losses(
+    rgb: Tensor, logits: Tensor, batch: dict[str, Tensor], perceptual: nn.Module, stage: int
+) -> dict[str, Tensor]:
+    """The same terms as the paper has them: over the whole view, every pixel alike.
+
+    Args:
+        rgb, logits, batch, perceptual: as in :func:`reconstruction_losses`.
+        stage: 1 or 2, see :func:`compared_views`.
+    """
+    shown, target = compared_views(rgb, logits, batch, stage)
+    return {
+        "l1": (shown - target).abs().mean(),
+        "perceptual": perceptual(shown, target).float().mean(),
+        "dice": dice(torch.sigmoid(logits), batch["mask"], batch["valid"]),
+    }
+
+
+def compared_views(
+    rgb: Tensor, logits: Tensor, batch: dict[str, Tensor], stage: int
+) -> tuple[Tensor, Tensor]:
+    """Rendered and true views over the random background, (b, 3, s, s) in [-1, 1] each.
+
+    The rendered one is cut out by the predicted mask in stage 1 and by the true mask in stage 2,
+    as in the released code. Beyond the driven picture both are equal.
+    """
+    background = batch["background"] * 2 - 1
+    target = composite(batch["image"] * 2 - 1, batch["mask"], background)
+    mask = torch.sigmoid(logits) if stage == 1 else batch["mask"]
+    valid = batch["valid"]
+    return composite(rgb, mask, background) * valid + target * (1 - valid), target
+
+
+def dice(mask: Tensor, target: Tensor, valid: Tensor) -> Tensor:
+    """Dice loss of masks (b, 1, s, s) in 0..1 where ``valid`` is 1."""
+    overlap = (mask * target * valid).sum()
+    sizes = ((mask.square() + target.square()) * valid).sum()
+    return 1 - 2 * overlap / sizes.clamp(min=1)

@@ -1,4 +1,4 @@
-"""Tracked training records: one compressed file per still or clip.
+"""Tracked training records, one per still or clip: a folder of .npz files, or of tar shards.
 
 A record keeps, for every frame, the 256 x 256 head crop, its masks, coefficients and camera, and
 for some frames (the sources) hair, shoulders and visibility as well. One identity has one shape.
@@ -6,6 +6,9 @@ for some frames (the sources) hair, shoulders and visibility as well. One identi
 
 from __future__ import annotations
 
+import hashlib
+import io
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +19,7 @@ from numpy.typing import NDArray
 from cvthead.camera import Camera
 from cvthead.coefficients import Coefficients
 from cvthead.deformation import Deformation
+from cvthead.errors import InputError
 from cvthead.source import HeadCrop, Source
 
 JPEG_QUALITY = 95
@@ -41,15 +45,9 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """An open record file; frames are decoded when asked for."""
+    """An open record; frames are decoded when asked for."""
 
-    path: Path
     arrays: dict[str, NDArray[np.generic]]
-
-    @classmethod
-    def open(cls, path: Path) -> Record:
-        with np.load(path, allow_pickle=False) as archive:
-            return cls(path, dict(archive))
 
     @property
     def frames(self) -> int:
@@ -94,6 +92,77 @@ class Record:
     def visible(self, number: int, points: int) -> NDArray[np.bool_]:
         bits = np.unpackbits(self.arrays[f"visible_{number}"].astype(np.uint8), count=points)
         return bits.astype(bool)
+
+
+@dataclass(frozen=True)
+class StoredRecord:
+    """Where a record lies.
+
+    Attributes:
+        name: of its own, within the folder.
+        frames: how many it holds; 1 for a still.
+        path: .npz file or .tar shard.
+        offset, size: bytes of the path that are the record.
+    """
+
+    name: str
+    frames: int
+    path: Path
+    offset: int
+    size: int
+
+    def read(self) -> bytes:
+        with self.path.open("rb") as file:
+            file.seek(self.offset)
+            return file.read(self.size)
+
+    def open(self) -> Record:
+        with np.load(io.BytesIO(self.read()), allow_pickle=False) as archive:
+            return Record(dict(archive))
+
+
+def index_of(shard: Path) -> Path:
+    """The file that says where a shard's records lie."""
+    return shard.with_suffix(".json")
+
+
+def stored_records(folder: Path) -> list[StoredRecord]:
+    """All records of a folder by name, from .npz files and from tar shards.
+
+    Raises:
+        InputError: there are none, or a shard lacks its index.
+    """
+    stored = []
+    for path in folder.glob("*.npz"):
+        with np.load(path, allow_pickle=False) as archive:
+            frames = len(archive["pose"])
+        stored.append(StoredRecord(path.name, frames, path, 0, path.stat().st_size))
+    for shard in folder.glob("*.tar"):
+        try:
+            index = json.loads(index_of(shard).read_bytes())
+        except (OSError, ValueError) as error:
+            raise InputError(
+                f"{shard} has no readable index {index_of(shard).name}",
+                hint="copy the .json files beside the shards as well",
+            ) from error
+        stored += [
+            StoredRecord(f"{key}.npz", at["frames"], shard, at["offset"], at["size"])
+            for key, at in index.items()
+        ]
+    if not stored:
+        raise InputError(
+            f"no records in {folder}", hint="make them with `cvthead data prepare VIDEOS OUT`"
+        )
+    return sorted(stored, key=lambda record: record.name)
+
+
+def records_hash(folder: Path) -> str:
+    """SHA-256 over names and contents of the records; the same for files and for shards."""
+    digest = hashlib.sha256()
+    for record in stored_records(folder):
+        digest.update(record.name.encode())
+        digest.update(record.read())
+    return digest.hexdigest()
 
 
 def write(path: Path, heads: list[HeadCrop], sources: dict[int, Source]) -> None:

@@ -1,235 +1,223 @@
-"""Plain training loop of the open preset.
+"""The training loop: one process, or many under ``torchrun``.
 
-    python -m cvthead.training.train RECORDS RUN --size 128 --steps 4000
-
-A run is a folder with ``checkpoint.pt`` (resumed from when present), ``log.jsonl`` and sample
-pictures. Stages at growing sizes share a run: start the next one with ``--init``.
+A run is a folder with ``checkpoint.pt`` (continued from when present), ``config.json``,
+``log.jsonl``, ``tensorboard/`` and ``samples.png``. The samples and random numbers of a step depend
+on the seed and the step alone, and the processes share each step's batch, so that neither a break
+nor their number changes what is trained on.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
-import math
+import os
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 import torch
-from einops import rearrange, repeat
+from einops import rearrange
+from lightning_fabric import Fabric
 from torch import Tensor, nn
+from torch.optim import Adam, AdamW, Optimizer
+from torch.optim.swa_utils import AveragedModel
 from torch.utils.data import DataLoader, Subset
 
-from cvthead.head.hierarchy import MeshHierarchy
+from cvthead.errors import InputError
+from cvthead.files import write_errors, write_file
 from cvthead.head.model import HeadModel
-from cvthead.model.config import OPEN
-from cvthead.model.cvthead import CVTHead
 from cvthead.points import PointLayout
-from cvthead.training.dataset import VIEWS, PairDataset
-from cvthead.training.losses import LossWeights, composite, reconstruction_losses
-from cvthead.training.perceptual import STLPIPS
+from cvthead.runtime.threads import cores
+from cvthead.training.checkpoint import RunState, resume, save, share_running, start_from
+from cvthead.training.config import TrainConfig
+from cvthead.training.dataset import PairDataset
+from cvthead.training.discriminator import MultiScaleDiscriminator, discriminator_loss
+from cvthead.training.log import RunLog, sample_grid, save_picture
+from cvthead.training.losses import compared_views
+from cvthead.training.objective import Objective
+from cvthead.training.renderers import Batch, build_renderer
+from cvthead.training.schedule import averaging, freeze_norms, learning_rate
+
+SMOOTHING = 0.98  # of the logged losses, per step
+PER_VIEW = ("image", "mask", "valid", "background", "weight", "zoom")
 
 
-@dataclass(frozen=True)
-class TrainConfig:
-    """One stage of training.
-
-    Attributes:
-        size: rendered height and width in pixels.
-        steps: length of the stage; the learning rate falls to a fiftieth over its second half.
-        batch: sources per step, each with VIEWS driven views.
-        learning_rate: peak, after a warm-up of 100 steps.
-        freeze_norm: share of the steps after which batch-norm statistics stay fixed, so that the
-            network is trained as it will be run.
-        average: decay of the averaged weights that are kept.
-        seed: of weights and samples.
-    """
-
-    size: int
-    steps: int
-    batch: int
-    learning_rate: float
-    freeze_norm: float = 0.6
-    average: float = 0.998
-    seed: int = 0
-
-
-def learning_rate(config: TrainConfig, step: int) -> float:
-    warm = min(1.0, (step + 1) / 100)
-    late = max(0.0, (step / config.steps - 0.5) * 2)
-    return (
-        config.learning_rate * warm * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * min(late, 1))))
-    )
-
-
-def averaging(decay: float) -> Callable[[Any, Any, Any], None]:
-    """Moving average whose window grows from nothing, so that a short run forgets its start."""
-
-    def update(averaged: Any, current: Any, count: Any) -> None:
-        rate = min(decay, (1 + int(count)) / (10 + int(count)))
-        torch.optim.swa_utils.get_ema_multi_avg_fn(rate)(averaged, current, count)  # type: ignore[no-untyped-call]
-
-    return update
-
-
-def freeze_norms(model: nn.Module) -> None:
-    for module in model.modules():
-        if isinstance(module, nn.BatchNorm2d):
-            module.eval()
-
-
-def render_views(model: CVTHead, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-    descriptors = model.describe(
-        batch["source"], batch["points"], batch["visible"], batch["anchor"]
-    )
-    descriptors = repeat(descriptors, "b p c -> (b v) p c", v=VIEWS)
-    driven = rearrange(batch["driven"], "b v p c -> (b v) p c")
-    return model.paint(driven, descriptors, rearrange(batch["warped"], "b v ... -> (b v) ..."))
-
-
-def train(
-    config: TrainConfig,
-    records: Path,
-    run: Path,
-    *,
-    init: Path | None = None,
-    sitting: int | None = None,
-) -> None:
-    """Train one stage, resuming from ``run/checkpoint.pt`` when it exists.
+def train(config: TrainConfig, *, sitting: int | None = None) -> Path:
+    """Run a configuration, or the rest of it.
 
     Args:
-        config: the stage.
-        records: folder made by cvthead.training.prepare.
-        run: folder of the run.
-        init: checkpoint of an earlier stage, whose weights are the start.
+        config: the run.
         sitting: stop after this many steps, to go on another time; None runs to the end.
+
+    Returns:
+        The checkpoint.
+
+    Raises:
+        InputError: no records, missing weights, a batch that the processes cannot share, or a
+            run folder of other settings.
     """
+    fabric = launched(config)
     torch.manual_seed(config.seed)
-    torch.set_num_threads(2)
-    run.mkdir(parents=True, exist_ok=True)
     head = HeadModel.load()
     layout = PointLayout.of(head)
-    model = CVTHead(OPEN, MeshHierarchy.load(), layout)
-    model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    averaged = torch.optim.swa_utils.AveragedModel(
-        model,
-        multi_avg_fn=averaging(config.average),
-        use_buffers=True,
-    )
-    optimizer = torch.optim.AdamW(
-        model.parameters(), config.learning_rate, betas=(0.9, 0.99), weight_decay=1e-4
-    )
-    perceptual = STLPIPS("alex", fused=True)
-    weights = LossWeights()
-    step = 0
-    checkpoint = run / "checkpoint.pt"
-    if checkpoint.exists():
-        state: dict[str, Any] = torch.load(checkpoint, weights_only=True)
-        model.load_state_dict(state["model"])
-        averaged.load_state_dict(state["averaged"])
-        optimizer.load_state_dict(state["optimizer"])
-        step = state["step"]
-    elif init is not None:
-        state = torch.load(init, weights_only=True)
-        model.load_state_dict(state["model"])
-        averaged.module.load_state_dict(state["model"])
     dataset = PairDataset(
-        records,
+        config.data,
         head,
         layout,
         size=config.size,
         seed=config.seed + config.size,
         samples=config.steps * config.batch,
+        deform=config.deformation,
     )
-    first = step
+    objective = Objective(config).to(fabric.device)
+    renderer = build_renderer(config, layout)
+    renderer.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    discriminator = MultiScaleDiscriminator() if config.stage == 2 else None
+    # Wrapped for the distributed forward pass; the state keeps the plain networks.
+    wrapped, optimiser = fabric.setup(renderer, new_optimiser(config, renderer))
+    judge, judge_optimiser = None, None
+    if discriminator is not None:
+        plain = new_optimiser(config, discriminator)
+        judge, judge_optimiser = fabric.setup(discriminator, plain)
+    state = RunState(
+        renderer.model,
+        AveragedModel(renderer.model, multi_avg_fn=averaging(config.average), use_buffers=True),
+        optimiser,
+        discriminator,
+        judge_optimiser,
+    )
+    with write_errors(config.run):
+        config.run.mkdir(parents=True, exist_ok=True)
+    checkpoint = config.run / "checkpoint.pt"
+    if checkpoint.exists():
+        resume(checkpoint, fabric, config, state)
+    elif config.init is not None:
+        start_from(config.init, state)
+    fabric.barrier()  # nobody writes before everybody has read
+    first = state.step
     last = config.steps if sitting is None else min(config.steps, first + sitting)
-    rest = Subset(dataset, range(first * config.batch, last * config.batch))
-    loader = DataLoader(rest, config.batch, num_workers=1, prefetch_factor=4)
-    log = (run / "log.jsonl").open("a")
-    (run / "config.json").write_text(json.dumps(asdict(config), indent=2))
-    running: dict[str, float] = {}
-    model.train()
-    saved = started = time.monotonic()
-    for batch in loader:
-        if step >= config.freeze_norm * config.steps:
-            freeze_norms(model)
-        for group in optimizer.param_groups:
-            group["lr"] = learning_rate(config, step)
-        with torch.autocast("cpu", torch.bfloat16):
-            rgb, logits = render_views(model, batch)
-            views = {
-                name: rearrange(batch[name], "b v ... -> (b v) ...")
-                for name in ("image", "mask", "valid", "background", "weight", "zoom")
-            } | {"window": batch["window"]}
-            losses = reconstruction_losses(rgb, logits, views, perceptual)
-        total = torch.stack([getattr(weights, k) * v for k, v in losses.items()]).sum()
-        optimizer.zero_grad(set_to_none=True)
-        total.backward()  # type: ignore[no-untyped-call]
-        nn.utils.clip_grad_norm_(model.parameters(), 1.0)
-        optimizer.step()
-        averaged.update_parameters(model)
-        step += 1
+    log = RunLog(config.run, first) if fabric.is_global_zero else None
+    if fabric.is_global_zero:
+        settings = config.model_dump(mode="json")
+        write_file(config.run / "config.json", json.dumps(settings, indent=2).encode())
+    renderer.train()
+    started = time.monotonic()
+    for batch in batches(fabric, config, dataset, first, last):
+        if state.step >= config.freeze_norm * config.steps:
+            freeze_norms(renderer)
+        for each in (optimiser, judge_optimiser):
+            for group in each.param_groups if each else ():
+                group["lr"] = learning_rate(config.optimiser, state.step, config.steps)
+        torch.manual_seed(step_seed(config.seed, state.step, fabric.global_rank))
+        views = per_view(batch)
+        with fabric.autocast():
+            rgb, logits = wrapped(batch)
+            losses = objective(rgb, logits, views, discriminator)
+        descend(fabric, config, wrapped, optimiser, objective.total(losses))
+        if judge is not None and judge_optimiser is not None:
+            with fabric.autocast():
+                shown, target = compared_views(rgb.detach(), logits.detach(), views, config.stage)
+                scores = judge(torch.cat([target, shown]))
+                halves = [[layer.chunk(2) for layer in scale] for scale in scores]
+                real, fake = ([[h[part] for h in scale] for scale in halves] for part in (0, 1))
+                losses["discriminator"] = discriminator_loss(real, fake)
+            descend(fabric, config, judge, judge_optimiser, losses["discriminator"])
+        state.averaged.update_parameters(renderer.model)
+        state.step += 1
         for name, value in losses.items():
             now = float(value.detach())
-            running[name] = running.get(name, now) * 0.98 + now * 0.02
-        if step % 50 == 0:
-            seconds = (time.monotonic() - started) / (step - first)
-            line = {"step": step, "seconds_per_step": round(seconds, 3)} | {
-                name: round(value, 4) for name, value in running.items()
-            }
-            print(json.dumps(line), file=log, flush=True)
-        if time.monotonic() - saved > 300 or step == last:
-            saved = time.monotonic()
-            save(checkpoint, model, averaged, optimizer, step)
-            save_picture(run / "samples.png", batch, rgb, logits)
-    log.close()
+            before = state.running.get(name, now)
+            state.running[name] = before * SMOOTHING + now * (1 - SMOOTHING)
+        if state.step % config.log_every == 0:
+            share_running(fabric, state)
+            if log is not None:
+                seconds = (time.monotonic() - started) / (state.step - first)
+                log.write(state.step, {"seconds_per_step": seconds} | state.running)
+        if state.step % config.save_every == 0 or state.step == last:
+            save(checkpoint, fabric, config, state)
+            if log is not None:
+                grid = sample_grid(batch, rgb, logits)
+                save_picture(config.run / "samples.png", grid)
+                log.picture(state.step, grid)
+    if log is not None:
+        log.close()
+    return checkpoint
 
 
-def save(
-    path: Path, model: nn.Module, averaged: nn.Module, optimizer: torch.optim.Optimizer, step: int
+def launched(config: TrainConfig) -> Fabric:
+    """The processes of this run, as ``torchrun`` has started them; alone without it.
+
+    Raises:
+        InputError: the batch cannot be shared out evenly.
+    """
+    world, local = (int(os.environ.get(name, "1")) for name in ("WORLD_SIZE", "LOCAL_WORLD_SIZE"))
+    if config.batch % world:
+        raise InputError(
+            f"{world} processes cannot share a batch of {config.batch} evenly",
+            hint="change the batch or the number of processes",
+        )
+    if "OMP_NUM_THREADS" not in os.environ:  # torchrun sets it
+        torch.set_num_threads(cores())
+    # The ablations leave weights of the full network unused.
+    ddp = "ddp" if config.features == "fused" else "ddp_find_unused_parameters_true"
+    fabric = Fabric(
+        devices=local,
+        num_nodes=world // local,
+        strategy=ddp if world > 1 else "auto",
+        precision=config.precision,
+    )
+    fabric.launch()
+    return fabric
+
+
+def step_seed(seed: int, step: int, rank: int) -> int:
+    """Of what the network draws in a step, so that nothing needs to be remembered of it."""
+    return int(np.random.SeedSequence((seed, step, rank)).generate_state(1)[0])
+
+
+def new_optimiser(config: TrainConfig, network: nn.Module) -> Optimizer:
+    """Adam or AdamW as configured."""
+    chosen = config.optimiser
+    kind = AdamW if chosen.name == "adamw" else Adam
+    return kind(
+        network.parameters(),
+        chosen.learning_rate,
+        betas=chosen.betas,
+        weight_decay=chosen.weight_decay,
+    )
+
+
+def batches(
+    fabric: Fabric, config: TrainConfig, dataset: PairDataset, first: int, last: int
+) -> Iterator[Batch]:
+    """This process's share of the samples of steps ``first`` to ``last`` - 1."""
+    share = config.batch // fabric.world_size
+    start = fabric.global_rank * share
+    numbers = [
+        step * config.batch + start + each for step in range(first, last) for each in range(share)
+    ]
+    loader = DataLoader(
+        Subset(dataset, numbers),
+        share,
+        num_workers=config.workers,
+        prefetch_factor=4 if config.workers else None,
+    )
+    for batch in loader:
+        yield {name: value.to(fabric.device) for name, value in batch.items()}
+
+
+def per_view(batch: Batch) -> dict[str, Tensor]:
+    """What the losses compare with, by view."""
+    views = {name: rearrange(batch[name], "b v ... -> (b v) ...") for name in PER_VIEW}
+    return views | {"window": batch["window"]}
+
+
+def descend(
+    fabric: Fabric, config: TrainConfig, network: nn.Module, optimiser: Optimizer, loss: Tensor
 ) -> None:
-    state = {
-        "model": model.state_dict(),
-        "averaged": averaged.state_dict(),
-        "optimizer": optimizer.state_dict(),
-        "step": step,
-    }
-    temporary = path.with_suffix(".tmp")
-    torch.save(state, temporary)
-    temporary.rename(path)
-
-
-def save_picture(path: Path, batch: dict[str, Tensor], rgb: Tensor, logits: Tensor) -> None:
-    """Rows of source, then target and result of each view."""
-    size = rgb.shape[-1]
-    source = nn.functional.interpolate(batch["source"][:, :3], (size, size)) * 0.5 + 0.5
-    target = composite(batch["image"], batch["mask"], torch.ones(()))
-    own = composite(rgb.detach() * 0.5 + 0.5, logits.detach().sigmoid(), torch.ones(()))
-    own = rearrange(own, "(b v) c h w -> b v c h w", v=VIEWS)
-    columns = [source] + [x[:, v] for v in range(VIEWS) for x in (target, own)]
-    grid = rearrange(torch.stack(columns), "n b c h w -> (b h) (n w) c")
-    pixels = (grid.float().clamp(0, 1).numpy() * 255).astype(np.uint8)
-    cv2.imwrite(str(path), np.ascontiguousarray(pixels[..., ::-1]))
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("records", type=Path, help="folder made by cvthead.training.prepare")
-    parser.add_argument("run", type=Path, help="folder of the run")
-    parser.add_argument("--size", type=int, default=128)
-    parser.add_argument("--steps", type=int, required=True)
-    parser.add_argument("--batch", type=int, default=4)
-    parser.add_argument("--learning-rate", type=float, default=5e-4)
-    parser.add_argument("--init", type=Path, help="checkpoint of an earlier stage")
-    parser.add_argument("--sitting", type=int, help="stop after this many steps; resume later")
-    a = parser.parse_args()
-    config = TrainConfig(a.size, a.steps, a.batch, a.learning_rate)
-    train(config, a.records, a.run, init=a.init, sitting=a.sitting)
-
-
-if __name__ == "__main__":
-    main()
+    """One step of an optimiser."""
+    optimiser.zero_grad(set_to_none=True)
+    fabric.backward(loss)
+    if config.optimiser.clip_norm:
+        fabric.clip_gradients(network, optimiser, max_norm=config.optimiser.clip_norm)
+    optimiser.step()
