@@ -16,6 +16,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cvthead.evaluation.picture_networks import PictureNetwork
 from cvthead.training.perceptual import STLPIPS
 
 Picture = NDArray[np.float32]
@@ -37,12 +38,14 @@ class Score:
         psnr: dB over all valid pixels, at most ``PSNR_CAP``.
         st_lpips: shift-tolerant LPIPS, AlexNet, spatial mean.
         ms_ssim: multi-scale structural similarity, at most 1.
+        lpips: the user's own LPIPS network; None without one.
     """
 
     l1: float
     psnr: float
     st_lpips: float
     ms_ssim: float
+    lpips: float | None = None
 
 
 def on_white(image: NDArray[np.uint8], mask: Picture) -> Picture:
@@ -96,6 +99,46 @@ def ms_ssim(a: Tensor, b: Tensor) -> Tensor:
     return product.mean(1)
 
 
+@dataclass(frozen=True)
+class RegionError:
+    """Errors added up over some pixels, so that pictures with few of them weigh little.
+
+    Attributes:
+        absolute: sum of absolute differences, 0..1 each, over pixels and channels.
+        squared: sum of squared differences.
+        count: of pixels.
+    """
+
+    absolute: float
+    squared: float
+    count: int
+
+    @classmethod
+    def of(cls, result: Picture, target: Picture, region: NDArray[np.bool_]) -> RegionError:
+        """Of two (H, W, 3) pictures over the pixels where ``region`` (H, W) is true."""
+        difference = (result - target)[region].astype(np.float64)
+        absolute, squared = np.abs(difference).sum(), np.square(difference).sum()
+        return cls(float(absolute), float(squared), int(region.sum()))
+
+    def __add__(self, other: RegionError) -> RegionError:
+        return RegionError(
+            self.absolute + other.absolute, self.squared + other.squared, self.count + other.count
+        )
+
+    @property
+    def l1(self) -> float:
+        """Mean absolute difference, 0..1; NaN of no pixels."""
+        return self.absolute / (3 * self.count) if self.count else float("nan")
+
+    @property
+    def psnr(self) -> float:
+        """dB of the mean squared difference, at most PSNR_CAP; NaN of no pixels."""
+        if not self.count:
+            return float("nan")
+        mean = max(self.squared / (3 * self.count), 1e-12)
+        return min(PSNR_CAP, -10 * float(np.log10(mean)))
+
+
 def tensor(pictures: Sequence[Picture]) -> Tensor:
     """(H, W, 3) pictures -> (B, 3, H, W)."""
     stacked = np.stack(pictures).astype(np.float32).transpose(0, 3, 1, 2)
@@ -103,11 +146,19 @@ def tensor(pictures: Sequence[Picture]) -> Tensor:
 
 
 class Metrics:
-    """The four metrics; holds the perceptual network."""
+    """The metrics of self-reenactment; holds the perceptual networks."""
 
-    def __init__(self, perceptual: STLPIPS | None = None) -> None:
-        """Raises AssetError if the perceptual weights cannot be had."""
+    def __init__(
+        self, perceptual: STLPIPS | None = None, lpips: PictureNetwork | None = None
+    ) -> None:
+        """Raises AssetError if the weights of ST-LPIPS cannot be had.
+
+        Args:
+            perceptual: None takes the AlexNet of the registry's wheel.
+            lpips: the user's; takes two batches of pictures.
+        """
         self.perceptual = perceptual or STLPIPS("alex")
+        self.lpips = lpips
 
     @torch.no_grad()
     def scores(
@@ -129,12 +180,17 @@ class Metrics:
         batch, goal = tensor(filled), tensor([target])
         distance = self.perceptual(batch * 2 - 1, goal * 2 - 1)
         similarity = ms_ssim(batch, goal.expand_as(batch))
+        lpips = None
+        if self.lpips:
+            pair = batch.numpy() * 2 - 1, goal.expand_as(batch).numpy() * 2 - 1
+            lpips = self.lpips(*pair)
         return [
             Score(
                 l1(result, target, mask, valid),
                 psnr(result, target, valid),
                 float(distance[i]),
                 float(similarity[i]),
+                None if lpips is None else float(lpips[i].mean()),
             )
             for i, result in enumerate(results)
         ]

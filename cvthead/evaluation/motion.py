@@ -8,8 +8,17 @@ from dataclasses import astuple, dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from cvthead.evaluation.table import Table
 from cvthead.tracking.networks import BLENDSHAPE_NAMES, Networks
 from cvthead.tracking.tracker import TrackedFace
+
+UNITS = {"yaw": "degrees", "jaw": "degrees", "smile": "score 0..1", "gaze": "degrees"}
+COLUMNS = {
+    "r over all frames": ".3f",
+    "r within clips": ".3f",
+    "mean error": ".3g",
+    "driver's spread": ".3g",
+}
 
 
 @dataclass(frozen=True)
@@ -83,3 +92,16 @@ def correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     a, b = a - a.mean(), b - b.mean()
     length = float(np.linalg.norm(a) * np.linalg.norm(b))
     return float(a @ b) / length if length > 1e-9 else float("nan")
+
+
+def motion_table(name: str, clips: Sequence[Sequence[tuple[Motion, Motion | None]]]) -> Table:
+    """Agreement of one method's results with their drivers; None is a result without a face."""
+    kept = [[(wanted, got) for wanted, got in clip if got is not None] for clip in clips]
+    frames = sum(map(len, clips))
+    lost = frames - sum(map(len, kept))
+    rows = {
+        f"{motion}, {UNITS[motion]}": (one.pooled, one.within, one.error, one.spread)
+        for motion, one in agreements(kept).items()
+    }
+    caption = f"Driver against the re-tracked result of {name} ({lost} of {frames} lost):"
+    return Table(f"motion, {name}", caption, COLUMNS, rows, "motion")

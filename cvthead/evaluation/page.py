@@ -1,4 +1,4 @@
-"""An HTML page to look at the results: people, drivers, results, and a sweep of poses."""
+"""An HTML page to look at the results: tables, then grids of pictures."""
 
 from __future__ import annotations
 
@@ -7,11 +7,7 @@ from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
-import numpy as np
-
-from cvthead.evaluation.metrics import on_white
-from cvthead.evaluation.protocol import BALD, MESH, OURS, Clip, Image, Reenactment
-from cvthead.evaluation.report import Report
+from cvthead.evaluation.shots import Image
 from cvthead.images import encode_image
 
 STYLE = """
@@ -24,98 +20,81 @@ td:first-child, th:first-child { text-align: left }
 img { width: 160px; height: 160px; display: block }
 """
 
-SHOWN = {"driver": None, OURS: OURS, MESH: MESH, BALD: BALD}
+
+Rows = dict[str, Sequence[Image | None]]
+"""Title -> one picture per column, None for an empty cell."""
 
 
-@dataclass(frozen=True)
-class Album:
-    """Writes pictures beside the page."""
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Pictures under a title.
 
-    folder: Path
+    Attributes:
+        columns: titles.
+        rows: of the grid.
+    """
 
-    def img(self, name: str, picture: Image) -> str:
-        """Save as JPEG and return the <img> element; ``name`` is unique and fit for a file."""
-        path = self.folder / f"{name}.jpg"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(encode_image(picture, "jpeg"))
-        place = f"{self.folder.name}/{path.name}"
-        return f'<img loading="lazy" src="{escape(place)}" alt="{escape(name)}">'
+    title: str
+    columns: Sequence[str]
+    rows: Mapping[str, Sequence[Image | None]]
 
 
-def write_page(
-    folder: Path,
-    report: Report,
-    clips: Sequence[Clip],
-    sweeps: Mapping[str, Mapping[str, Image]],
-    shown: int = 4,
-) -> Path:
-    """Write ``index.html`` and its ``images``.
+def write_page(folder: Path, markdown: str, sections: Mapping[str, Sequence[Grid]]) -> Path:
+    """Write ``index.html`` and its ``images`` to a folder, made if needed.
 
     Args:
-        folder: made if needed.
-        clips: people to show.
-        sweeps: by clip name, title -> picture; all with the same titles.
-        shown: at most so many driving frames of each clip.
+        markdown: the report.
+        sections: heading -> grids.
 
     Returns:
         The page.
     """
-    album = Album(folder / "images")
     parts = [
         "<!doctype html><meta charset=utf-8><title>Evaluation</title>",
-        f"<style>{STYLE}</style><h1>Self-reenactment</h1>",
-        tables(report.markdown()),
-        "<h2>People</h2>",
+        f"<style>{STYLE}</style><h1>Evaluation</h1>",
+        tables(markdown),
     ]
-    parts += [person(clip, album, shown) for clip in clips]
-    if sweeps:
-        titles = list(next(iter(sweeps.values())))
-        head = "".join(f"<th>{escape(title)}</th>" for title in titles)
-        rows = [
-            "<tr>"
-            + "".join(
-                f"<td>{album.img(f'{name}-sweep-{i}', pictures[title])}</td>"
-                for i, title in enumerate(titles)
-            )
-            + "</tr>"
-            for name, pictures in sweeps.items()
+    images = folder / "images"
+    images.mkdir(parents=True, exist_ok=True)
+    for heading, grids in sections.items():
+        if grids:
+            parts.append(f"<h2>{escape(heading)}</h2>")
+        parts += [
+            grid_html(grid, images, f"{slug(heading)}-{number}")
+            for number, grid in enumerate(grids)
         ]
-        parts.append(
-            f"<h2>Sweep</h2><div class=wide><table><tr>{head}</tr>{''.join(rows)}</table></div>"
-        )
     page = folder / "index.html"
     page.write_text("\n".join(parts), encoding="utf-8")
     return page
 
 
-def person(clip: Clip, album: Album, shown: int) -> str:
-    """One clip: the source, then a row per method under the drivers."""
-    step = np.linspace(0, len(clip.drivers) - 1, min(shown, len(clip.drivers))).round()
-    drivers = [clip.drivers[int(i)] for i in step]
-    source = album.img(f"{clip.name}-source", picture_on_white(clip.source.image, clip.source.mask))
-    rows = []
-    for title, method in SHOWN.items():
-        cells = [
-            f"<td>{album.img(f'{clip.name}-{d.frame}-{slug(title)}', row_picture(d, method))}</td>"
-            for d in drivers
-        ]
-        first = f"<td>{source}</td>" if method is None else "<td></td>"
-        rows.append(f"<tr><th>{escape(title)}</th>{first}{''.join(cells)}</tr>")
-    marks = "".join(f"<th>frame {d.frame}, {d.scores[OURS].psnr:.1f} dB</th>" for d in drivers)
+def grid_html(grid: Grid, images: Path, name: str) -> str:
+    """The grid as a table; its pictures are written to ``images``, their names beginning with
+    ``name``."""
+    head = "".join(f"<th>{escape(title)}</th>" for title in grid.columns)
+    rows = [
+        f"<tr><th>{escape(title)}</th>"
+        + "".join(
+            f"<td>{img(images / f'{name}-{row}-{column}.jpg', picture)}</td>"
+            for column, picture in enumerate(pictures)
+        )
+        + "</tr>"
+        for row, (title, pictures) in enumerate(grid.rows.items())
+    ]
     return (
-        f"<h3>{escape(clip.name)}</h3><div class=wide><table>"
-        f"<tr><th></th><th>source</th>{marks}</tr>{''.join(rows)}</table></div>"
+        f"<h3>{escape(grid.title)}</h3><div class=wide><table><tr><th></th>{head}</tr>"
+        + "".join(rows)
+        + "</table></div>"
     )
 
 
-def row_picture(driven: Reenactment, method: str | None) -> Image:
-    if method is None:
-        return picture_on_white(driven.target.image, driven.target.mask)
-    return picture_on_white(driven.drawn[method].rgb, driven.drawn[method].alpha)
-
-
-def picture_on_white(image: Image, mask: np.ndarray) -> Image:
-    return (on_white(image, mask) * 255).round().astype(np.uint8)
+def img(path: Path, picture: Image | None) -> str:
+    """Save as JPEG and return the <img> element, empty for no picture."""
+    if picture is None:
+        return ""
+    path.write_bytes(encode_image(picture, "jpeg"))
+    place = escape(f"{path.parent.name}/{path.name}")
+    return f'<img loading="lazy" src="{place}" alt="{escape(path.stem)}">'
 
 
 def slug(title: str) -> str:
@@ -123,12 +102,13 @@ def slug(title: str) -> str:
 
 
 def tables(markdown: str) -> str:
-    """The report's Markdown (paragraphs and tables only) as HTML."""
+    """The report's Markdown (headings, paragraphs and tables only) as HTML."""
     out: list[str] = []
     for block in markdown.strip().split("\n\n"):
         lines = block.split("\n")
         if not lines[0].startswith("|"):
-            out.append(f"<p>{escape(block)}</p>")
+            title = block.removeprefix("## ")
+            out.append(f"<p>{escape(block)}</p>" if title == block else f"<h2>{escape(title)}</h2>")
             continue
         cells = [[escape(c.strip()) for c in line.strip("|").split("|")] for line in lines]
         out.append("<table><tr>" + "".join(f"<th>{c}</th>" for c in cells[0]) + "</tr>")

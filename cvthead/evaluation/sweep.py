@@ -9,8 +9,8 @@ import numpy as np
 from cvthead.camera import Camera
 from cvthead.coefficients import Coefficients
 from cvthead.crop import head_crop
-from cvthead.evaluation.metrics import on_white
-from cvthead.evaluation.protocol import Draw, Image
+from cvthead.evaluation.methods import Draw
+from cvthead.evaluation.shots import Image
 from cvthead.head.arkit import ArkitMap
 from cvthead.head.model import HeadModel
 
@@ -51,6 +51,5 @@ def sweep(
     pictures = {}
     for title, coefficients in poses(arkit, source).items():
         crop = head_crop(head, coefficients, camera)
-        drawn = draw(coefficients, camera.in_crop(crop))
-        pictures[title] = (on_white(drawn.rgb, drawn.alpha) * 255).round().astype(np.uint8)
+        pictures[title] = draw(coefficients, camera.in_crop(crop)).on_white
     return pictures

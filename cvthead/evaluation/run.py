@@ -1,0 +1,241 @@
+"""The whole evaluation: clips, pairs of clips, stills, speed; then report and picture page."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+from tqdm import tqdm
+
+from cvthead.errors import FaceError, InputError
+from cvthead.evaluation.across import cross_tables
+from cvthead.evaluation.big_pose import DEGREES
+from cvthead.evaluation.clip import Bench, Clip, measure_clip
+from cvthead.evaluation.groups import (
+    Reconstruction,
+    group_tables,
+    read_stills,
+    reconstruct,
+    shots_of,
+)
+from cvthead.evaluation.motion import motion_table
+from cvthead.evaluation.page import Grid, write_page
+from cvthead.evaluation.paper_metrics import UserNetworks
+from cvthead.evaluation.reenactment import paper_table, part_table, score_table
+from cvthead.evaluation.report import Report
+from cvthead.evaluation.speed import frames_per_second
+from cvthead.evaluation.steadiness import steadiness_table
+from cvthead.evaluation.sweep import sweep
+from cvthead.evaluation.table import Table
+from cvthead.evaluation.two_sources import likeness_table
+from cvthead.files import write_file
+from cvthead.head.arkit import ArkitMap
+from cvthead.preset import Preset
+
+T = TypeVar("T")
+
+SELF, CROSS, STEADY = "Self-reenactment", "Cross-identity", "Steadiness"
+BIG, SOURCES, GROUPS, SWEEP = "Big poses", "Two sources of one person", "Groups", "Sweep"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How much is measured.
+
+    Attributes:
+        data: folder with clips/val and stills/val.
+        output: folder for the report and the page.
+        every: take every n-th clip and still.
+        crossings: drivers of other people per source.
+        runs: of the measurement of speed.
+        people: shown on the page.
+    """
+
+    data: Path
+    output: Path
+    every: int
+    crossings: int
+    runs: int
+    people: int
+
+
+def evaluate(
+    plan: Plan, bench: Bench, pipelines: Mapping[str, Preset[Any]], networks: UserNetworks
+) -> Report:
+    """Measure, and write ``index.html``, ``report.md`` and ``report.json``.
+
+    Args:
+        pipelines: whose speed is measured, by method.
+
+    Raises:
+        InputError: no clips, or none in which a face can be tracked.
+    """
+    seconds: dict[str, float] = {}
+    clips = timed(seconds, "clips", lambda: measure_clips(bench, plan))
+    sections = clip_sections(bench, clips)
+    grids = clip_grids(clips, plan.people)
+    first, driver = clips[0].source, clips[0].lent[-1]
+    speeds = {}
+    if "speed" in bench.parts:
+        speeds = timed(
+            seconds,
+            "speed",
+            lambda: {
+                name: frames_per_second(pipeline, first, driver, plan.runs)
+                for name, pipeline in pipelines.items()
+            },
+        )
+    if "cross" in bench.parts:
+        tables, pictures = timed(
+            seconds,
+            "cross-identity",
+            lambda: cross_tables(bench, clips, plan.crossings, networks, speeds),
+        )
+        sections[CROSS] = tables
+        grids |= {heading: some[: plan.people] for heading, some in pictures.items()}
+    if "groups" in bench.parts:
+        sections[GROUPS] = timed(seconds, "groups", lambda: measure_groups(bench, plan))
+    if "self" in bench.parts:
+        grids[SWEEP] = sweeps(bench, spread(clips, plan.people))
+    report = Report(about(bench, clips), sections, seconds)
+    plan.output.mkdir(parents=True, exist_ok=True)
+    write_file(plan.output / "report.md", report.markdown().encode())
+    text = json.dumps(report.json(), indent=1, allow_nan=False)
+    write_file(plan.output / "report.json", text.encode())
+    write_page(plan.output, report.markdown(), grids)
+    return report
+
+
+def timed(seconds: dict[str, float], part: str, work: Callable[[], T]) -> T:
+    """The result of ``work``; its seconds are noted under ``part``."""
+    start = time.perf_counter()
+    result = work()
+    seconds[part] = time.perf_counter() - start
+    return result
+
+
+def measure_clips(bench: Bench, plan: Plan) -> list[Clip]:
+    """Every n-th clip; those without a trackable face are left out.
+
+    Raises:
+        InputError: none is left.
+    """
+    folder = plan.data / "clips" / "val"
+    paths = sorted(folder.glob("*.mp4"))[:: plan.every]
+    # Pictures fill the memory; only those of the people on the page are kept.
+    shown = set(spread(paths, plan.people))
+    clips = []
+    for path in tqdm(paths, desc="clips", unit="clip"):
+        clip = measure_clip(bench, path)
+        if clip is None:
+            tqdm.write(f"{path.name}: no trackable face")
+        else:
+            clips.append(clip if path in shown else replace(clip, grids=big_only(clip.grids)))
+    if not clips:
+        raise InputError(
+            f"no usable clips in {folder}", hint="pass the folder with clips/val/*.mp4"
+        )
+    return clips
+
+
+def big_only(grids: Mapping[str, Grid]) -> dict[str, Grid]:
+    """Big poses are few and the hardest: all are shown."""
+    return {key: grid for key, grid in grids.items() if key.startswith("big")}
+
+
+def spread(items: Sequence[T], count: int) -> list[T]:
+    """At most ``count``, evenly spaced."""
+    return list(items[:: max(1, len(items) // count)][:count])
+
+
+def clip_sections(bench: Bench, clips: Sequence[Clip]) -> dict[str, list[Table]]:
+    """Tables of what is measured on each clip alone."""
+    sections: dict[str, list[Table]] = {}
+    own = [one for clip in clips for one in clip.reenacted]
+    if own:
+        sections[SELF] = [
+            score_table("self-reenactment", "Both pictures on white by the target's mask:", own),
+            score_table(
+                "self-reenactment, own masks",
+                "Each result on white by its own mask:",
+                own,
+                own=True,
+            ),
+            part_table("unseen", "Over the pixels alone that the source did not show.", own),
+            paper_table("The paper's columns; LPIPS is absent without a network for it.", own),
+            *(motion_table(name, [clip.motion[name] for clip in clips]) for name in bench.trained),
+        ]
+    far = [one for clip in clips for one in clip.far]
+    if far:
+        found = sum(clip.far_found for clip in clips)
+        people = len({one.clip for one in far})
+        caption = (
+            f"Source and driver more than {DEGREES:.0f} degrees apart: {len(far)} pairs of "
+            f"{people} people, evenly spread over the {found} that were found."
+        )
+        sections[BIG] = [
+            score_table(
+                "big poses", f"{caption} Both pictures on white by the target's mask:", far
+            ),
+            part_table("big poses, unseen", "Over the unseen pixels alone.", far),
+        ]
+    steady = [clip.steadiness for clip in clips if clip.steadiness is not None]
+    if steady:
+        sections[STEADY] = [steadiness_table(steady)]
+    alike = [clip.likeness for clip in clips if clip.likeness is not None]
+    if alike:
+        sections[SOURCES] = [likeness_table(alike)]
+    return sections
+
+
+def clip_grids(clips: Sequence[Clip], people: int) -> dict[str, list[Grid]]:
+    """Pictures by heading."""
+    shown = [clip.grids for clip in clips]
+    return {
+        SELF: [grids["self"] for grids in shown if "self" in grids],
+        BIG: [grid for grids in shown for key, grid in grids.items() if key.startswith("big")],
+        SOURCES: [grids["sources"] for grids in shown if "sources" in grids][:people],
+    }
+
+
+def measure_groups(bench: Bench, plan: Plan) -> list[Table]:
+    """Every n-th still of each set, by group."""
+    stills = read_stills(plan.data)[:: plan.every]
+    done: list[Reconstruction] = []
+    for still in tqdm(stills, desc="stills", unit="still"):
+        shots = shots_of(bench.tracker, still)
+        if shots is None:
+            continue
+        try:
+            persons = {name: bench.methods[name](shots[0]) for name in bench.trained}
+        except FaceError:
+            continue
+        done.append(reconstruct(bench.metrics, still.group, persons, *shots))
+    return group_tables(done, len(stills)) if done else []
+
+
+def sweeps(bench: Bench, clips: Sequence[Clip]) -> list[Grid]:
+    """The first trained method under a fixed series of poses and expressions. Only the open
+    preset's expressions are those of the ARKit map."""
+    grids = []
+    arkit = ArkitMap.load()
+    for clip in clips:
+        person = clip.persons[bench.trained[0]]
+        if person.preset == "open":
+            pictures = sweep(person.head, arkit, person.coefficients, person.camera, person.draw)
+            grids.append(
+                Grid(clip.source.name, list(pictures), {bench.trained[0]: [*pictures.values()]})
+            )
+    return grids
+
+
+def about(bench: Bench, clips: Sequence[Clip]) -> list[str]:
+    frames = sum(len(clip.reenacted) for clip in clips)
+    return [
+        f"{len(clips)} clips, {frames} driving frames. Source: first trackable frame of the clip. "
+        "256 x 256 crop of 0.36 m; ST-LPIPS: AlexNet, spatial mean."
+    ]
