@@ -16,7 +16,6 @@ from collections.abc import Callable
 from pathlib import Path
 from types import EllipsisType
 
-from cvthead.avatar import Avatar
 from cvthead.errors import (
     AvatarExpiredError,
     AvatarFileError,
@@ -25,6 +24,7 @@ from cvthead.errors import (
     StoreError,
 )
 from cvthead.files import write_file
+from cvthead.preset import AnyAvatar, load_avatar
 from cvthead.record import AvatarRecord, Box, read_record, write_record
 
 SUFFIX, RECORD = ".avatar", ".json"
@@ -67,7 +67,7 @@ class AvatarCache:
         self.hits = self.misses = self.evictions = 0
         self._clock = clock
         self._lock = threading.Lock()
-        self._memory: OrderedDict[str, tuple[Avatar, int]] = OrderedDict()
+        self._memory: OrderedDict[str, tuple[AnyAvatar, int]] = OrderedDict()
         # Records never change, so one that was read need not be read again.
         self._records: dict[str, AvatarRecord] = {}
         self._used = 0
@@ -75,7 +75,7 @@ class AvatarCache:
 
     def put(
         self,
-        avatar: Avatar,
+        avatar: AnyAvatar,
         *,
         owner: str = "",
         lifetime: float | EllipsisType | None = ...,
@@ -128,7 +128,11 @@ class AvatarCache:
             raise AvatarExpiredError("the avatar has expired", hint="upload the portrait again")
         return record
 
-    def get(self, key: str, *, owner: str = "") -> Avatar:
+    def in_memory(self, key: str) -> bool:
+        """Whether :meth:`get` needs no reading from disk; it may still be another owner's."""
+        return key in self._memory
+
+    def get(self, key: str, *, owner: str = "") -> AnyAvatar:
         """The avatar of an id.
 
         Raises:
@@ -143,7 +147,7 @@ class AvatarCache:
                 return self._memory[key][0]
             self.misses += 1
         try:
-            avatar = Avatar.load(self._path(key))
+            avatar: AnyAvatar = load_avatar(self._path(key))
         except AvatarFileError:
             self.record(key, owner=owner)  # another thread may have deleted it meanwhile
             raise
@@ -251,7 +255,7 @@ class AvatarCache:
         self._path(key).unlink(missing_ok=True)
         self._forget(key, record=True)
 
-    def _remember(self, key: str, avatar: Avatar, size: int) -> None:
+    def _remember(self, key: str, avatar: AnyAvatar, size: int) -> None:
         if key in self._memory:
             self._used -= self._memory.pop(key)[1]
         self._memory[key] = (avatar, size)

@@ -13,7 +13,7 @@ from cvthead.errors import InputError
 
 
 @contextmanager
-def atomic_path(path: Path | str, *, folder: bool = False) -> Iterator[Path]:
+def atomic_path(path: Path | str, *, folder: bool = False, replace: bool = False) -> Iterator[Path]:
     """A temporary sibling of ``path``, renamed to it when the block succeeds.
 
     Whatever ends the block early (also KeyboardInterrupt) removes the temporary file, and a
@@ -22,18 +22,22 @@ def atomic_path(path: Path | str, *, folder: bool = False) -> Iterator[Path]:
     Args:
         path: the file, or with ``folder`` the folder, to write.
         folder: yield a new empty folder instead of the name of a file to create.
+        replace: a folder that is already there gives way to the new one once that is complete.
+            No system call swaps folders everywhere, so for a moment there is none; what fails
+            then brings the old one back.
 
     Raises:
         InputError: the parent folder does not exist, ``path`` is a folder (with ``folder``: a
-            file or a folder that is not empty), or the operating system refuses.
+            file or, unless ``replace``, a folder that is not empty), or the operating system
+            refuses.
     """
     target = Path(path)
     if not target.parent.is_dir():
         raise InputError(
             f"{target.parent} is not a folder", hint="Create the output's folder first."
         )
-    empty = target.is_dir() and not any(target.iterdir())
-    if (folder and target.exists() and not empty) or (not folder and target.is_dir()):
+    gives_way = target.is_dir() and (replace or not any(target.iterdir()))
+    if (folder and target.exists() and not gives_way) or (not folder and target.is_dir()):
         raise InputError(f"{target} is already there", hint="Choose another name.")
     # A sibling is on the same file system, so that the rename is atomic.
     temporary = target.with_name(f".{target.name[:100]}.{secrets.token_hex(4)}.part")
@@ -43,6 +47,9 @@ def atomic_path(path: Path | str, *, folder: bool = False) -> Iterator[Path]:
                 temporary.mkdir()
         yield temporary
         with write_errors(target):
+            if replace and target.is_dir():
+                _swap(temporary, target)
+                return
             if folder and target.is_dir():
                 target.rmdir()
             os.replace(temporary, target)
@@ -51,6 +58,18 @@ def atomic_path(path: Path | str, *, folder: bool = False) -> Iterator[Path]:
             shutil.rmtree(temporary, ignore_errors=True)
         else:
             temporary.unlink(missing_ok=True)
+
+
+def _swap(new: Path, old: Path) -> None:
+    """The folder ``new`` in the place of ``old``, which is removed."""
+    aside = new.with_suffix(".old")
+    os.replace(old, aside)
+    try:
+        os.replace(new, old)
+    except BaseException:
+        os.replace(aside, old)
+        raise
+    shutil.rmtree(aside, ignore_errors=True)
 
 
 @contextmanager

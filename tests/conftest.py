@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -16,3 +20,22 @@ def shared() -> Path:
     if not path.is_dir():
         pytest.skip(f"no reference data at {path}; set CVTHEAD_SHARED")
     return path
+
+
+@pytest.fixture(scope="session")
+def official_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A made-up official release in ``whole``, its import in ``model``, what the command said in
+    ``said``. Made once: it takes more than a gigabyte."""
+    import made_official  # needs PyTorch, which few tests do
+
+    from cvthead.cli.main import main
+
+    base = tmp_path_factory.mktemp("official")
+    (base / "whole").mkdir()
+    made_official.write_whole(base / "whole", made_official.state(), made_official.tables())
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said):
+        assert main(["import-official", str(base / "whole"), "-o", str(base / "model")]) == 0
+    (base / "said").write_text(said.getvalue())
+    yield base
+    shutil.rmtree(base)

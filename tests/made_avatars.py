@@ -11,6 +11,7 @@ from cvthead.avatar import Avatar
 from cvthead.camera import Camera, Crop
 from cvthead.coefficients import Coefficients
 from cvthead.deformation import Deformation
+from cvthead.preset import AnyAvatar
 
 
 def jpeg(size: int = 256, mode: str = "RGB") -> bytes:
@@ -46,7 +47,8 @@ def made_avatar(seed: int = 0, points: int = 50) -> Avatar:
     )
 
 
-def same(a: Avatar, b: Avatar) -> bool:
+def same(a: AnyAvatar, b: Avatar) -> bool:
+    assert isinstance(a, Avatar)
     # Not the bytes of the files: safetensors orders its metadata at random.
     return plain(a) == plain(b) and all(map(np.array_equal, arrays(a), arrays(b)))
 

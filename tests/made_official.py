@@ -18,6 +18,10 @@ from scipy.sparse import csc_matrix
 from scipy.spatial import Delaunay, cKDTree
 from torch import Tensor
 
+from cvthead.camera import Camera, Crop
+from cvthead.coefficients import Coefficients
+from cvthead.official.avatar import OfficialAvatar
+from cvthead.official.crop import FaceSquare
 from cvthead.official.flame import PREFIX, from_checkpoint
 from cvthead.official.keys import released_shapes
 
@@ -122,6 +126,21 @@ def state() -> State:
     return result
 
 
+def avatar() -> OfficialAvatar:
+    """Of seeded numbers, for tests that render nothing."""
+    rng = np.random.default_rng(4)
+    return OfficialAvatar(
+        rng.normal(size=(5023, 32)).astype(np.float32),
+        rng.normal(size=(5023, 3)).astype(np.float32),
+        Coefficients.zeros(),
+        Camera(5.5, 0.01, -0.02),
+        FaceSquare(130.0, 120.0, 150.0),
+        Crop(3.0, 4.0, 200.0),
+        rng.integers(0, 256, (256, 256, 3)).astype(np.uint8),
+        "0123456789abcdef",
+    )
+
+
 def write_whole(folder: Path, weights: State, mesh: dict[str, list[Any]]) -> None:
     """A release whose ``cvthead.pt`` holds everything."""
     checkpoint = {
@@ -149,7 +168,7 @@ def write_parts(folder: Path, weights: State, mesh: dict[str, list[Any]], flame:
     torch.save(weights["deform_mean"], data / "mean_deform.pt")
     torch.save(weights["deform_basis"].reshape(-1, 60), data / "u_full.pt")
     tensors = {key: value.numpy() for key, value in _cut(weights, PREFIX).items()}
-    write_flame(folder / flame, tensors, wrapped=flame == "generic_model.pkl")
+    write_flame(folder / flame, tensors, year=2020 if flame == "generic_model.pkl" else 2023)
     embedding = {
         "full_lmk_faces_idx": tensors["full_lmk_faces_idx"],
         "full_lmk_bary_coords": tensors["full_lmk_bary_coords"],
@@ -158,25 +177,37 @@ def write_parts(folder: Path, weights: State, mesh: dict[str, list[Any]], flame:
     np.save(data / "landmark_embedding.npy", np.array(embedding, dtype=object), allow_pickle=True)
 
 
-def write_flame(path: Path, tensors: Arrays, *, wrapped: bool) -> None:
-    """FLAME's own file. ``wrapped``: as FLAME 2020, whose arrays are chumpy objects."""
+def write_flame(path: Path, tensors: Arrays, *, year: int) -> None:
+    """FLAME's own file with 300 columns of shape and 100 of expression.
+
+    Args:
+        year: 2020 is written as by Python 2, arrays as chumpy objects and the joint regressor
+            sparse; 2023 as by Python 3, plain arrays alone.
+    """
     n = len(tensors["v_template"])
     tables = from_checkpoint(tensors)
     basis = np.zeros((n, 3, 400))
     basis[:, :, :100], basis[:, :, 300:350] = tables.shape_basis, tables.expression_basis
-    parents = PARENTS.astype(np.uint32)
-    with chumpy() as array:
-        wrap = array if wrapped else np.asarray
-        stored = {
-            "f": tables.faces.astype(np.uint32),
-            "v_template": wrap(tables.template.astype(np.float64)),
-            "shapedirs": wrap(basis),
-            "posedirs": wrap(tables.pose_basis.T.reshape(n, 3, 36).astype(np.float64)),
-            "weights": wrap(tables.weights.astype(np.float64)),
-            "J_regressor": csc_matrix(tables.joint_regressor.astype(np.float64)),
-            "kintree_table": np.stack([parents, np.arange(5, dtype=np.uint32)]),
-            "bs_style": "lbs",
-        }
+    regressor = tables.joint_regressor.astype(np.float64)
+    joints = regressor @ tables.template
+    arrays = {
+        "v_template": tables.template.astype(np.float64),
+        "shapedirs": basis,
+        "posedirs": tables.pose_basis.T.reshape(n, 3, 36).astype(np.float64),
+        "weights": tables.weights.astype(np.float64),
+        "J": joints,
+    }
+    if year == 2023:
+        parents = np.stack([PARENTS, np.arange(5)])
+        stored = arrays | {"J_regressor": regressor, "kintree_table": parents}
+        stored |= {"f": tables.faces.astype(np.int64), "bs_type": "lrotmin", "bs_style": "lbs"}
+        path.write_bytes(pickle.dumps(stored, protocol=4))
+        return
+    parents = np.stack([PARENTS.astype(np.uint32), np.arange(5, dtype=np.uint32)])
+    with chumpy() as wrap:
+        stored = {name: wrap(value) for name, value in arrays.items()}
+        stored |= {"J_regressor": csc_matrix(regressor), "kintree_table": parents}
+        stored |= {"f": tables.faces.astype(np.uint32), "bs_type": "lrotmin", "bs_style": "lbs"}
         path.write_bytes(pickle.dumps(stored, protocol=2))
 
 
@@ -187,6 +218,11 @@ def chumpy() -> Iterator[type]:
 
     class Ch:
         def __init__(self, x: NDArray[Any]) -> None:
+            # What chumpy keeps beside the array; its caches it leaves out.
+            self._dirty_vars = {"x"}
+            self._itr = None
+            self._make_dense = self._make_sparse = False
+            self._depends_on_deps: dict[str, object] = {}
             self.x = x
 
     Ch.__module__, Ch.__qualname__ = "chumpy.ch", "Ch"

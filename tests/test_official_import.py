@@ -2,59 +2,33 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import json
 import os
 import pickle
+import pickletools
 import shutil
-from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 
 import made_official
 import numpy as np
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from cvthead.cli.main import main
-from cvthead.controls import Controls
-from cvthead.errors import AssetError, AvatarFileError, CoefficientsError, ModelChangedError
-from cvthead.head.arkit import ARKIT_NAMES
-from cvthead.images import read_image
-from cvthead.official.avatar import OfficialAvatar
+from cvthead.errors import AssetError, InputError
 from cvthead.official.flame import from_checkpoint, from_files
 from cvthead.official.importer import import_official
 from cvthead.official.keys import part, released_shapes
-from cvthead.official.manifest import FILES, LICENCES, Manifest
+from cvthead.official.manifest import FILES, LICENCES, RECORD, Manifest, write_manifest
 from cvthead.official.pipeline import OfficialPipeline
 
 PORTRAIT = Path(__file__).parents[1] / "examples" / "astronaut.png"
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A release in ``whole``, its import in ``model``, what the command said in ``said``."""
-    base = tmp_path_factory.mktemp("official")
-    (base / "whole").mkdir()
-    made_official.write_whole(base / "whole", made_official.state(), made_official.tables())
-    said = io.StringIO()
-    with contextlib.redirect_stdout(said):
-        assert main(["import-official", str(base / "whole"), "-o", str(base / "model")]) == 0
-    (base / "said").write_text(said.getvalue())
-    yield base
-    shutil.rmtree(base)  # more than a gigabyte
-
-
-@pytest.fixture(scope="module")
-def pipeline(folder: Path) -> OfficialPipeline:
-    return OfficialPipeline.load(folder / "model")
-
-
-@pytest.fixture(scope="module")
-def avatar(pipeline: OfficialPipeline) -> OfficialAvatar:
-    return pipeline.encode(read_image(PORTRAIT))
+@pytest.fixture
+def folder(official_folder: Path) -> Path:
+    return official_folder
 
 
 def test_sources_hashes_and_licences_are_recorded(folder: Path) -> None:
@@ -80,143 +54,118 @@ def test_separate_files_give_the_same_model(folder: Path, tmp_path: Path) -> Non
     shutil.rmtree(tmp_path)
 
 
-@pytest.mark.parametrize("name", ["generic_model.pkl", "flame2023.pkl"])
-def test_flame_2020_and_2023(name: str, tmp_path: Path) -> None:
+def landmarks_file(folder: Path) -> Path:
     tensors = made_official.flame_state()
-    made_official.write_flame(tmp_path / name, tensors, wrapped=name == "generic_model.pkl")
     embedding = np.array({k: tensors[k] for k in tensors if k.startswith("full")}, dtype=object)
-    np.save(tmp_path / "landmarks.npy", embedding, allow_pickle=True)
-    found = from_files(tmp_path / name, tmp_path / "landmarks.npy").arrays()
+    np.save(folder / "landmarks.npy", embedding, allow_pickle=True)
+    return folder / "landmarks.npy"
+
+
+@pytest.mark.parametrize("year", [2020, 2023])
+def test_flame_2020_and_2023(year: int, tmp_path: Path) -> None:
+    """Both layouts give the tables that the checkpoint would have had."""
+    tensors = made_official.flame_state()
+    made_official.write_flame(tmp_path / "flame.pkl", tensors, year=year)
+    found = from_files(tmp_path / "flame.pkl", landmarks_file(tmp_path)).arrays()
     for key, value in from_checkpoint(tensors).arrays().items():
         assert np.array_equal(found[key], value), key
 
 
-def test_portrait_to_frames(
-    pipeline: OfficialPipeline, avatar: OfficialAvatar, tmp_path: Path
+def test_the_released_landmark_file(shared: Path, tmp_path: Path) -> None:
+    """It also holds PyTorch tensors, which are not wanted and not loaded."""
+    made_official.write_flame(tmp_path / "flame.pkl", made_official.flame_state(), year=2020)
+    released = shared / "reference" / "official-data" / "landmark_embedding.npy"
+    found = from_files(tmp_path / "flame.pkl", released)
+    assert len(np.unique(found.landmark_faces)) > 60
+    np.testing.assert_allclose(found.landmark_bary.sum(axis=1), 1, atol=1e-6)
+
+
+def test_the_layouts_differ_as_the_files_do(tmp_path: Path) -> None:
+    """Or the test above would read the same file twice."""
+    for year in (2020, 2023):
+        made_official.write_flame(tmp_path / str(year), made_official.flame_state(), year=year)
+    old, new = (
+        {(o.name, a) for o, a, _ in pickletools.genops((tmp_path / str(y)).read_bytes())}
+        for y in (2020, 2023)
+    )
+    for name in ("chumpy.ch Ch", "__builtin__ set"):
+        assert ("GLOBAL", name) in old
+    assert not [argument for _, argument in new if "chumpy" in str(argument)]
+
+
+@pytest.mark.parametrize(
+    ("entry", "shape", "message"),
+    [
+        ("shapedirs", (5023, 3, 150), "bases of shape"),
+        ("v_template", (4000, 3), r"template has shape \(4000, 3\)"),
+        ("weights", (5023, 3), "weights has shape"),
+        ("J_regressor", (4, 5023), "joint_regressor has shape"),
+        ("kintree_table", (2, 24), "joints are not global, neck, jaw and two eyes"),
+        ("f", (3, 3), "faces has shape"),
+    ],
+)
+def test_another_head_model_is_refused(
+    entry: str, shape: tuple[int, ...], message: str, tmp_path: Path
 ) -> None:
-    """Encode, save, load, render, drive and sweep; each runs the networks it needs, no other."""
-    networks = pipeline.networks
-    calls: Counter[str] = Counter()
-    hooks = []
-    for name, module in (
-        ("parsing", networks.parsing.net),
-        ("hair", networks.hair.hair_model.conv1),
-        ("deca", networks.deca),
-        ("encoder", networks.network.encoder),
-        ("unet", networks.network.unet),
-    ):
-
-        def count(_module: nn.Module, _inputs: object, _out: Tensor, name: str = name) -> None:
-            calls[name] += 1
-
-        hooks.append(module.register_forward_hook(count))
-    try:
-        avatar.save(tmp_path / "me.avatar")
-        assert (tmp_path / "me.avatar").stat().st_size < 2**20
-        loaded = OfficialAvatar.load(tmp_path / "me.avatar")
-        still = pipeline.render(loaded)
-        assert np.array_equal(still.rgb, pipeline.render(avatar).rgb)
-        assert still.rgb.shape == (256, 256, 3)
-        assert still.rgb.std() > 1
-        assert calls == {"unet": 2}
-
-        calls.clear()
-        driven = pipeline.drive(loaded, read_image(PORTRAIT))
-        assert calls == {"deca": 1}
-        # The portrait driving itself changes nothing.
-        assert np.array_equal(pipeline.render_coefficients(loaded, *driven).rgb, still.rgb)
-        assert calls == {"deca": 1, "unet": 1}
-
-        calls.clear()
-        sweep = [
-            pipeline.render(loaded, controls).rgb
-            for controls in (
-                Controls(shape=np.eye(100)[0] * 2, mode="relative"),
-                Controls(expression=np.eye(50)[0] * 2, mode="relative"),
-                Controls(jaw=(0.3, 0, 0)),
-                Controls(global_rotation=(0, 0.5, 0)),
-                Controls(arkit={"jawOpen": 1.0, "mouthSmileLeft": 0.5}),
-            )
-        ]
-        assert calls == {"unet": len(sweep)}
-        frames = [still.rgb, *sweep]
-        assert len({frame.tobytes() for frame in frames}) == len(frames)
-    finally:
-        for hook in hooks:
-            hook.remove()
+    path = tmp_path / "flame.pkl"
+    made_official.write_flame(path, made_official.flame_state(), year=2023)
+    path.write_bytes(pickle.dumps(pickle.loads(path.read_bytes()) | {entry: np.zeros(shape)}))
+    with pytest.raises(AssetError, match=message):
+        from_files(path, landmarks_file(tmp_path))
 
 
-def test_command_line(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("CVTHEAD_OFFICIAL", str(folder / "model"))
-    frames = [{"jaw": [0.1 * i, 0, 0]} for i in range(3)]
-    (tmp_path / "talk.json").write_text(json.dumps({"fps": 10, "frames": frames}))
-    official = ["--preset", "official"]
-    for arguments in (
-        ["encode", str(PORTRAIT), *official, "-o", "me.avatar"],
-        ["render", "me.avatar", "--jaw", "0.3,0,0", "-o", "jaw.png"],
-        ["render", "me.avatar", "--arkit", "jawOpen=0.5", "-o", "arkit.png"],
-        ["animate", "me.avatar", *official, "--driving", "talk.json", "-o", "talk.png"],
-        ["animate", "me.avatar", *official, "--driving", str(PORTRAIT), "-o", "driven.png"],
-        ["sweep", "me.avatar", *official, "--cell", "64", "-o", "sweep.png"],
-    ):
-        assert main(arguments) == 0, arguments
-        assert Path(arguments[-1]).stat().st_size > 1000
-    assert not np.array_equal(read_image(Path("jaw.png")), read_image(Path("driven.png")))
+def small_release(folder: Path) -> Path:
+    """A release that is refused only after its checkpoint was read: ``transform.pkl`` is not."""
+    folder.mkdir()
+    release(folder, {**blanks(), "deca.flame.parents": torch.tensor([-1, 0, 1, 1, 1])})
+    (folder / "transform.pkl").write_bytes(b"damaged")
+    return folder
 
 
-def test_presets_do_not_mix(
+def earlier_import(folder: Path) -> Path:
+    """As the import writes it; what is in the files does not matter here."""
+    folder.mkdir(parents=True)
+    for name in FILES:
+        (folder / name).write_bytes(b"earlier")
+    write_manifest(folder, ())
+    return folder
+
+
+def test_replacing_an_import(
     folder: Path,
-    avatar: OfficialAvatar,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    avatar.save("me.avatar")
-    assert main(["sweep", "me.avatar", "-o", "out.png"]) == 2
-    assert "use --preset official" in capsys.readouterr().err
-    monkeypatch.setenv("CVTHEAD_OFFICIAL", str(tmp_path / "nothing"))
-    assert main(["render", "me.avatar", "-o", "out.png"]) == 2
-    assert "cvthead import-official" in capsys.readouterr().err
+    """In the default folder, here through a link."""
+    model = earlier_import(tmp_path / "data" / "real")
+    (tmp_path / "data" / "official").symlink_to(model)
+    monkeypatch.setenv("CVTHEAD_OFFICIAL", str(tmp_path / "data" / "official"))
+    assert main(["import-official", str(folder / "whole")]) == 2
+    assert "replace it with --replace" in capsys.readouterr().err
+    assert (model / FILES[0]).read_bytes() == b"earlier"
+    assert main(["import-official", str(folder / "whole"), "--replace"]) == 0
+    assert Manifest.load(model).fingerprint == Manifest.load(folder / "model").fingerprint
+    assert {path.name for path in model.iterdir()} == {*FILES, RECORD}
+    assert {path.name for path in model.parent.iterdir()} == {"real", "official"}
+    shutil.rmtree(model)
 
 
-def test_expression_moves_expression(pipeline: OfficialPipeline, avatar: OfficialAvatar) -> None:
-    """The released demo writes it into shape."""
-    wanted = avatar.coefficients.expression + 1
-    rest = pipeline.head.rest(avatar.coefficients)
-    moved = pipeline.head.expression_basis.sum(axis=2)
-    changed = type(avatar.coefficients)(avatar.coefficients.shape, wanted, avatar.coefficients.pose)
-    assert np.allclose(pipeline.head.rest(changed) - rest, moved, atol=1e-6)
+def test_a_failed_replacement_leaves_the_earlier_import(tmp_path: Path) -> None:
+    model = earlier_import(tmp_path / "model")
+    before = {path.name: path.read_bytes() for path in model.iterdir()}
+    with pytest.raises(AssetError, match=r"transform\.pkl is refused"):
+        import_official(small_release(tmp_path / "release"), model, replace=True)
+    assert {path.name: path.read_bytes() for path in model.iterdir()} == before
+    assert {path.name for path in tmp_path.iterdir()} == {"model", "release"}
 
 
-def test_arkit_goes_through_flame_landmarks(pipeline: OfficialPipeline) -> None:
-    table = pipeline.arkit
-    assert table.expression.shape == (50, len(ARKIT_NAMES))
-    assert np.isfinite(table.expression).all()
-    tongue, smile = (
-        np.abs(table.to_coefficients({name: 1.0}).expression).max()
-        for name in ("tongueOut", "mouthSmileLeft")
-    )
-    assert tongue < 1e-2 * smile  # it moves no landmark
-    assert table.to_coefficients({"jawOpen": 1.0}).joint("jaw")[0] > 0.05
-    with pytest.raises(CoefficientsError):
-        table.to_coefficients({"jawWide": 1.0})
-
-
-def test_avatars_are_checked(
-    pipeline: OfficialPipeline, avatar: OfficialAvatar, tmp_path: Path
-) -> None:
-    path = tmp_path / "me.avatar"
-    avatar.save(path)
-    path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(AvatarFileError):
-        OfficialAvatar.load(path)
-    with pytest.raises(AvatarFileError):
-        OfficialAvatar.load(tmp_path / "none.avatar")
-    path.write_bytes(avatar.to_bytes().replace(avatar.fingerprint.encode(), b"0" * 16))
-    with pytest.raises(ModelChangedError):
-        pipeline.render(OfficialAvatar.load(path))
+def test_only_an_import_is_replaced(tmp_path: Path) -> None:
+    model = earlier_import(tmp_path / "model")
+    (model / "thesis.txt").write_text("mine")
+    with pytest.raises(InputError, match=r"holds more than an import: thesis\.txt"):
+        import_official(small_release(tmp_path / "release"), model, replace=True)
+    assert (model / "thesis.txt").read_text() == "mine"
 
 
 def test_an_altered_model_is_refused(folder: Path, tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from cvthead.camera import Camera
 from cvthead.model.bisenet import foreground
 from cvthead.model.paper import HARD_MASK
 from cvthead.model.splat import clamped_pixel_index, nearest_points
+from cvthead.official import torch_files
 from cvthead.official.avatar import OfficialAvatar
 from cvthead.official.crop import FaceSquare
 from cvthead.official.importer import import_official
@@ -69,8 +70,9 @@ def fixed_parts(shared: Path) -> dict[str, torch.Tensor]:
         "lbs_weights": head.weights,
         "faces_tensor": head.faces.astype(np.int64),
     }
-    mean = torch.load(data / "mean_deform.pt", map_location="cpu", weights_only=True)
-    basis = torch.load(data / "u_full.pt", map_location="cpu", weights_only=True)
+    # Released as CUDA tensors.
+    mean = torch_files.load_tensor(data / "mean_deform.pt")
+    basis = torch_files.load_tensor(data / "u_full.pt")
     return {f"deca.flame.{key}": torch.from_numpy(np.array(a)) for key, a in flame.items()} | {
         "face_parsing.mean": torch.tensor([0.485, 0.456, 0.406]),
         "face_parsing.std": torch.tensor([0.229, 0.224, 0.225]),

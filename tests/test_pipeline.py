@@ -60,7 +60,9 @@ def test_second_render_of_an_id_runs_no_encoder(
     key = cache.put(counted.encode(portrait)).id
     assert (describe.count, paint.count) == (1, 0)
     for jaw in (0.0, 0.2):
-        counted.render(cache.get(key), Controls(jaw=(jaw, 0, 0)))
+        stored = cache.get(key)
+        assert isinstance(stored, Avatar)
+        counted.render(stored, Controls(jaw=(jaw, 0, 0)))
     assert (describe.count, paint.count) == (1, 2)
 
 

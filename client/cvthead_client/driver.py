@@ -84,6 +84,12 @@ class LocalTracker:
             raise CVTHeadClientError(
                 "the avatar's coefficients are not known", hint="use Client.get(id)"
             )
+        if avatar.preset != "open":
+            raise CVTHeadClientError(
+                f"the avatar is of the preset {avatar.preset}; its coefficients mean another head "
+                "than the one that is tracked here",
+                hint="use --frames",
+            )
         pose, camera = portrait.pose, portrait.camera
         joints = (pose.global_rotation, pose.neck, pose.jaw, pose.left_eye, pose.right_eye)
         self._portrait = Portrait(

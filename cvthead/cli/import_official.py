@@ -32,6 +32,11 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         metavar="FOLDER",
         help=f"new folder for the converted model (default: {default_folder()})",
     )
+    parser.add_argument(
+        "--replace",
+        action="store_true",
+        help="an earlier import in that folder gives way once the new one is complete",
+    )
     parser.set_defaults(run=run)
 
 
@@ -49,7 +54,7 @@ def run(args: argparse.Namespace) -> None:
     if args.output is None:
         with write_errors(output):
             output.parent.mkdir(parents=True, exist_ok=True)
-    for source in import_official(args.folder, output):
+    for source in import_official(args.folder, output, replace=args.replace):
         print(f"{source.name}: {', '.join(source.used_for)}")
     print("\nLicences of what was imported; none of it is part of cvthead:")
     for licence in LICENCES:

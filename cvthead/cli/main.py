@@ -12,11 +12,22 @@ from importlib.metadata import version
 from importlib.util import find_spec
 from typing import NoReturn, TextIO
 
-from cvthead.cli import animate, bench, encode, import_official, render, sweep, track
+from cvthead.cli import (
+    animate,
+    bench,
+    data,
+    encode,
+    evaluate,
+    import_official,
+    render,
+    sweep,
+    track,
+    train,
+)
 from cvthead.errors import CVTHeadError, InputError, SeveralFacesError
 from cvthead.runtime.threads import one_thread_per_call
 
-COMMANDS = (encode, render, animate, track, sweep, bench, import_official)
+COMMANDS = (encode, render, animate, track, sweep, bench, import_official, data, train, evaluate)
 FAILED = 2
 INTERRUPTED = 130  # what shells report for a command ended by Ctrl-C
 

@@ -6,11 +6,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from cvthead.avatar import Avatar
 from cvthead.errors import InputError
 from cvthead.images import read_image
-from cvthead.official.avatar import OfficialAvatar, is_official
-from cvthead.preset import PRESETS, Preset
+from cvthead.preset import PRESETS, Preset, load_avatar
 
 
 def add_portrait_options(parser: argparse.ArgumentParser, name: str, what: str) -> None:
@@ -55,12 +53,3 @@ def read_avatar(pipeline: Preset[Any], path: Path, face: int | None) -> Any:
             f"{path} is of the preset {avatar.preset}", hint=f"use --preset {avatar.preset}"
         )
     return avatar
-
-
-def load_avatar(path: Path) -> Avatar | OfficialAvatar:
-    """An avatar file of either preset.
-
-    Raises:
-        AvatarFileError: as Avatar.load.
-    """
-    return OfficialAvatar.load(path) if is_official(path) else Avatar.load(path)

@@ -16,12 +16,11 @@ from cvthead.cli.picture import (
     check_size,
     write_picture,
 )
-from cvthead.cli.portrait import load_avatar
 from cvthead.cli.values import vector, weights
 from cvthead.coefficients import Coefficients
 from cvthead.composite import Composer
 from cvthead.controls import FIELDS, Controls, Mode
-from cvthead.preset import load_preset
+from cvthead.preset import load_avatar, load_preset
 
 FORMS = """\
 Coefficients are written as all numbers (--jaw 0.3,0,0), as single ones (--expression

@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvthead.cli.picture import IMAGE_FORMATS, check_output, write_picture
+from cvthead.cli.portrait import add_preset_option
 from cvthead.coefficients import JOINTS
 from cvthead.files import write_file
 from cvthead.images import read_image
+from cvthead.preset import FaceTracker, load_preset
 from cvthead.provenance import SourceType
 from cvthead.tracking.networks import BLENDSHAPE_NAMES
 from cvthead.tracking.tracker import TrackedFace, Tracker
@@ -34,6 +36,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument(
         "--face", type=int, metavar="N", help="which face, 0 = largest (default: the largest)"
     )
+    add_preset_option(parser)
     parser.add_argument(
         "--overlay",
         type=Path,
@@ -55,7 +58,8 @@ def run(args: argparse.Namespace) -> None:
     if args.overlay is not None:
         check_output(args.overlay, tuple(IMAGE_FORMATS), alpha=False)
     image = read_image(args.image)
-    tracker = Tracker.load()
+    # Of the open preset the tracker alone, without the renderer's networks.
+    tracker = Tracker.load() if args.preset == "open" else load_preset(args.preset).tracker
     face = tracker.track(image, face=args.face)
     if args.overlay is not None:
         drawn = overlay(tracker, image, face)
@@ -81,7 +85,7 @@ def summary(face: TrackedFace) -> str:
     )
 
 
-def report(tracker: Tracker, face: TrackedFace) -> dict[str, Any]:
+def report(tracker: FaceTracker, face: TrackedFace) -> dict[str, Any]:
     """Everything that was measured.
 
     ``frames`` has the form of cvthead/cli/motion_file.py, without the shape, so that a portrait
@@ -112,7 +116,7 @@ def report(tracker: Tracker, face: TrackedFace) -> dict[str, Any]:
     }
 
 
-def overlay(tracker: Tracker, image: NDArray[np.uint8], face: TrackedFace) -> NDArray[np.uint8]:
+def overlay(tracker: FaceTracker, image: NDArray[np.uint8], face: TrackedFace) -> NDArray[np.uint8]:
     """The picture with the front of the fitted mesh and the landmarks."""
     head = tracker.head
     points = face.camera.project(head.vertices(face.coefficients))[:, :2].astype(np.float64)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 
 from cvthead.avatar_file import opened, packed
-from cvthead.camera import CROP_PIXELS, Camera
+from cvthead.camera import CROP_PIXELS, Camera, Crop
 from cvthead.coefficients import EXPRESSION_SIZE, POSE_SIZE, SHAPE_SIZE, Coefficients
 from cvthead.files import write_file
 from cvthead.model.config import PAPER
@@ -20,7 +20,7 @@ from cvthead.official.crop import FaceSquare
 from cvthead.official.manifest import PRESET
 
 FORMAT = "cvthead-official-avatar"
-VERSION = "1"
+VERSION = "2"
 VERTICES = 5023  # of FLAME
 ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
     "descriptors": ("F32", (VERTICES, PAPER.descriptor_size)),
@@ -30,6 +30,7 @@ ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
     "pose": ("F32", (POSE_SIZE,)),
     "camera": ("F64", (3,)),
     "square": ("F64", (3,)),
+    "crop": ("F64", (3,)),
     "background": ("U8", (CROP_PIXELS, CROP_PIXELS, 3)),
 }
 
@@ -46,7 +47,8 @@ class OfficialAvatar:
             with the head, as in the released code.
         coefficients: of the portrait, of FLAME.
         camera: of the portrait, in the 256 x 256 picture's normalised coordinates.
-        square: what DECA saw of the picture.
+        square: what DECA saw of the 256 x 256 picture.
+        crop: the square of the portrait that became that picture, in pixels of the portrait.
         background: (256, 256, 3) uint8 RGB, the picture with the person painted away.
         fingerprint: of the weights that made it.
     """
@@ -56,6 +58,7 @@ class OfficialAvatar:
     coefficients: Coefficients
     camera: Camera
     square: FaceSquare
+    crop: Crop
     background: NDArray[np.uint8]
     fingerprint: str
 
@@ -65,7 +68,7 @@ class OfficialAvatar:
 
     def to_bytes(self) -> bytes:
         """One safetensors file."""
-        camera, square = self.camera, self.square
+        camera, square, crop = self.camera, self.square, self.crop
         tensors = {
             "descriptors": self.descriptors,
             "offsets": self.offsets,
@@ -74,6 +77,7 @@ class OfficialAvatar:
             "pose": self.coefficients.pose,
             "camera": np.array([camera.scale, camera.tx, camera.ty]),
             "square": np.array([square.x, square.y, square.size]),
+            "crop": np.array([crop.left, crop.top, crop.size], np.float64),
             "background": self.background,
         }
         metadata = {
@@ -135,15 +139,19 @@ def _array(file: Any, name: str) -> NDArray[Any]:
 
 def _avatar(arrays: dict[str, NDArray[Any]], fingerprint: str) -> OfficialAvatar:
     camera, square = Camera(*arrays["camera"].tolist()), FaceSquare(*arrays["square"].tolist())
+    crop = Crop(*arrays["crop"].tolist())
     camera.check()
     if square.size < 1:
         raise ValueError(f"the face square has size {square.size:g}")
+    if crop.size <= 0:
+        raise ValueError(f"crop has size {crop.size:g}")
     return OfficialAvatar(
         arrays["descriptors"],
         arrays["offsets"],
         Coefficients(arrays["shape"], arrays["expression"], arrays["pose"]),
         camera,
         square,
+        crop,
         arrays["background"],
         fingerprint,
     )

@@ -1,6 +1,8 @@
 """The user's FLAME (Li et al. 2017), from the released checkpoint or from FLAME's own file.
 
-FLAME 2020 (``generic_model.pkl``) and FLAME 2023 (``flame2023.pkl``) have the same layout.
+FLAME 2020 (``generic_model.pkl``) and FLAME 2023 (``flame2023.pkl``) have the same entries: the
+first 300 columns of ``shapedirs`` are shape, the last 100 expression. Each may be a chumpy object
+(as Python 2 wrote them in 2020), a sparse matrix or a plain array.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from numpy.typing import NDArray
 
 from cvthead.coefficients import EXPRESSION_SIZE, POSE_SIZE, SHAPE_SIZE
 from cvthead.errors import AssetError
-from cvthead.head.model import PARENTS, POSE_FEATURES, HeadModel, Region
+from cvthead.head.model import JOINT_COUNT, PARENTS, POSE_FEATURES, HeadModel, Region
 from cvthead.official.keys import part
 from cvthead.official.unpickle import HINT, load_npy, load_pickle
 
@@ -62,6 +64,11 @@ class Flame:
             "landmark_bary": (LANDMARKS, 3),
             "rest_pose": (POSE_SIZE,),
             "template": (vertices, 3),
+            "shape_basis": (vertices, 3, SHAPE_SIZE),
+            "expression_basis": (vertices, 3, EXPRESSION_SIZE),
+            "pose_basis": (POSE_FEATURES, 3 * vertices),
+            "joint_regressor": (JOINT_COUNT, vertices),
+            "weights": (vertices, JOINT_COUNT),
         }
         for name, shape in expected.items():
             if getattr(self, name).shape != shape:

@@ -25,11 +25,13 @@ from cvthead.official import flame, torch_files
 from cvthead.official.keys import check, part, released_shapes
 from cvthead.official.manifest import (
     DECA,
+    FILES,
     FLAME,
     HAIR,
     MESH,
     NETWORK,
     PARSING,
+    RECORD,
     SourceFile,
     file_sha256,
     write_manifest,
@@ -145,35 +147,60 @@ class _Folder:
         )
 
 
-def import_official(source: Path, output: Path) -> tuple[SourceFile, ...]:
+def import_official(source: Path, output: Path, *, replace: bool = False) -> tuple[SourceFile, ...]:
     """Convert the released files.
 
     Args:
         source: folder with ``cvthead.pt``, ``transform.pkl`` and, for what the checkpoint does
             not hold, the separate files; they may lie in folders below it.
         output: new folder for safetensors files and ``model.json``.
+        replace: an earlier import in ``output`` gives way once the new one is complete; until
+            then, and if anything fails, it stays as it was.
 
     Returns:
         The files that were used.
 
     Raises:
-        InputError: ``source`` is no folder, or ``output`` cannot be written.
+        InputError: ``source`` is no folder, ``output`` cannot be written or is there already
+            (with ``replace``: holds anything but an import).
         AssetError: a file is missing, damaged, holds more than data, or its keys and shapes are
             not the released ones; lists them all.
     """
     if not source.is_dir():
         raise InputError(f"{source} is not a folder", hint=PLACES)
+    check_output(output, replace=replace)
     folder = _Folder(source)
     state = _complete_state(folder)
     tables = _flame(folder, state)
     hierarchy = read_hierarchy(folder.find((TABLES,), "mesh hierarchy"))
     files = _converted(state, tables, hierarchy)
-    with atomic_path(output, folder=True) as temporary, write_errors(output):
+    # Resolved, for the folder that a link names is meant, not the link.
+    new = atomic_path(output.resolve(), folder=True, replace=replace)
+    with new as temporary, write_errors(output):
         for name, tensors in files.items():
             save_file({key: value.contiguous() for key, value in tensors.items()}, temporary / name)
         sources = folder.sources()
         write_manifest(temporary, sources)
     return sources
+
+
+def check_output(output: Path, *, replace: bool) -> None:
+    """Refuse a folder that cannot be written before gigabytes are read, and never remove what is
+    not an import.
+
+    Raises:
+        InputError: it holds other files than an import has; or, without ``replace``, any.
+    """
+    found = {path.name for path in output.iterdir()} if output.is_dir() else set()
+    if found and not replace:
+        raise InputError(
+            f"{output} is already there", hint="replace it with --replace, or choose another -o"
+        )
+    if others := found - {*FILES, RECORD}:
+        raise InputError(
+            f"{output} holds more than an import: {', '.join(sorted(others)[:5])}",
+            hint="choose another folder with -o",
+        )
 
 
 def _complete_state(folder: _Folder) -> State:

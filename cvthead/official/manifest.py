@@ -26,6 +26,8 @@ MESH = "mesh.safetensors"
 FILES = (NETWORK, PARSING, HAIR, DECA, FLAME, MESH)
 HINT = "import the official files again with `cvthead import-official`"
 FOLDER_VARIABLE = "CVTHEAD_OFFICIAL"
+WEIGHTS_PART = "CVTHead weights and tables (cvthead.pt, data/)"
+HEAD_PART = "FLAME head model"
 
 
 @dataclass(frozen=True)
@@ -39,12 +41,12 @@ class Licence:
 
 LICENCES = (
     Licence(
-        "CVTHead weights and tables (cvthead.pt, data/)",
+        WEIGHTS_PART,
         "published without a licence: all rights are the authors'",
         "https://github.com/HowieMa/CVTHead",
     ),
     Licence(
-        "FLAME head model",
+        HEAD_PART,
         "the licence accepted at the download; FLAME 2020: non-commercial research only",
         "https://flame.is.tue.mpg.de/modellicense.html",
     ),

@@ -7,11 +7,11 @@ U-Net, a driving frame one DECA pass more.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ from cvthead.head.model import HeadModel
 from cvthead.model.paper import over_white
 from cvthead.official.arkit import fit_arkit
 from cvthead.official.avatar import OfficialAvatar
+from cvthead.official.background import without_person
 from cvthead.official.crop import FaceSquare
 from cvthead.official.manifest import PRESET, default_folder
 from cvthead.official.networks import OfficialNetworks, picture_tensor
@@ -35,9 +36,6 @@ from cvthead.tracking.tracker import TrackedFace, Tracker
 
 Array = NDArray[np.float32]
 Image = NDArray[np.uint8]
-
-INPAINT_MARGIN = 9
-SMALL = CROP_PIXELS // 4
 
 
 class Driven(NamedTuple):
@@ -65,15 +63,18 @@ class OfficialPipeline:
     tracker: OfficialTracker
 
     @classmethod
-    def load(cls, folder: Path | None = None) -> OfficialPipeline:
+    def load(cls, folder: Path | None = None, *, threads: int | None = None) -> OfficialPipeline:
         """Load an imported model.
 
         Args:
             folder: of the import; None takes :func:`default_folder`.
+            threads: of PyTorch, in the whole process; None leaves it as it is.
 
         Raises:
             AssetError: nothing was imported there, or it is damaged.
         """
+        if threads is not None:
+            torch.set_num_threads(threads)
         networks = OfficialNetworks.load(folder or default_folder())
         finder, flame = Tracker.load(), networks.flame
         head = flame.head()
@@ -138,6 +139,7 @@ class OfficialPipeline:
             estimate.coefficients,
             camera,
             square,
+            picture.crop,
             without_person(picture.pixels, mask[0, 0].numpy() > 0),
             self.fingerprint,
         )
@@ -214,7 +216,18 @@ class OfficialPipeline:
         Raises:
             ModelChangedError: as :meth:`render`.
         """
-        rgb, logits = self.paint(avatar, self.pose(avatar, coefficients, camera, square))
+        return self._frame(avatar, self.pose(avatar, coefficients, camera, square))
+
+    def paint_many(self, frames: Sequence[tuple[OfficialAvatar, Array]]) -> list[Frame]:
+        """Splat and U-Net of avatars with the points of :meth:`pose`.
+
+        One after the other: a batch is not faster on a CPU, and a picture must not depend on
+        what is rendered beside it.
+        """
+        return [self._frame(avatar, points) for avatar, points in frames]
+
+    def _frame(self, avatar: OfficialAvatar, points: Array) -> Frame:
+        rgb, logits = self.paint(avatar, points)
         painted = torch.cat([0.5 * (rgb + 1), torch.sigmoid(logits)], dim=1)
         pixels = (painted * 255).round().to(torch.uint8)[0].permute(1, 2, 0).numpy()
         return Frame(np.ascontiguousarray(pixels[..., :3]), np.ascontiguousarray(pixels[..., 3]))
@@ -273,16 +286,3 @@ class OfficialPipeline:
         points = camera.project(self.head.vertices(coefficients) + offsets)
         points[:, 2] *= np.float32(square.depth_ratio)
         return points
-
-
-def without_person(picture: Image, person: NDArray[np.bool_]) -> Image:
-    """(256, 256, 3) picture with the person filled from the background around."""
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (INPAINT_MARGIN,) * 2)
-    wide = cv2.dilate(person.astype(np.uint8), kernel)
-    small = cv2.resize(picture, (SMALL, SMALL), interpolation=cv2.INTER_AREA)
-    hole = cv2.resize(wide * 255, (SMALL, SMALL), interpolation=cv2.INTER_AREA) > 0
-    filled = cv2.inpaint(small, hole.astype(np.uint8), 3, cv2.INPAINT_TELEA)
-    filled = cv2.resize(filled, (CROP_PIXELS, CROP_PIXELS), interpolation=cv2.INTER_CUBIC)
-    soft = cv2.GaussianBlur(wide.astype(np.float32), (0, 0), 3)[..., None]
-    soft = np.maximum(soft, wide[..., None])
-    return np.asarray(picture * (1 - soft) + filled * soft, dtype=np.uint8)

@@ -15,9 +15,11 @@ from cvthead.head.model import HeadModel
 from cvthead.model.deca import DecaEncoder, split_codes
 from cvthead.official.crop import FaceSquare
 from cvthead.tracking.landmarks68 import landmarks68
+from cvthead.tracking.networks import Networks
 from cvthead.tracking.tracker import TrackedFace, Tracker
 
 Image = NDArray[np.uint8]
+WHOLE = Crop(0.0, 0.0, float(CROP_PIXELS))
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,10 +29,12 @@ class Picture:
     Attributes:
         pixels: (256, 256, 3) uint8 RGB.
         landmarks: (68, 2) in its pixels, the first pixel's centre at 0.
+        crop: the square of a larger picture that it shows.
     """
 
     pixels: Image
     landmarks: NDArray[np.floating]
+    crop: Crop = WHOLE
 
     @property
     def square(self) -> FaceSquare:
@@ -72,6 +76,11 @@ class OfficialTracker:
     deca: DecaEncoder
     rest_pose: Array
 
+    @property
+    def networks(self) -> Networks:
+        """The open tracker's face networks, which also score ARKit's blendshapes."""
+        return self.finder.networks
+
     def track(
         self,
         image: Image,
@@ -87,9 +96,9 @@ class OfficialTracker:
         """
         before = previous.found if isinstance(previous, OfficialFace) else None
         found = self.finder.track(image, face=face, only_one=only_one, previous=before)
-        picture, crop = self.cut(image, found)
+        picture = self.cut(image, found)
         estimate = self.estimate(picture.pixels, picture.square)
-        camera = _in_image(picture.square.camera(estimate.cam), crop)
+        camera = _in_image(picture.square.camera(estimate.cam), picture.crop)
         kept = {field.name: getattr(found, field.name) for field in fields(TrackedFace)}
         kept |= {"coefficients": estimate.coefficients, "camera": camera}
         return OfficialFace(**kept, found=found)
@@ -104,14 +113,14 @@ class OfficialTracker:
     ) -> Picture:
         """The square around a head of any picture; arguments and errors as :meth:`track`."""
         found = self.finder.track(image, face=face, only_one=only_one, previous=previous)
-        return self.cut(image, found)[0]
+        return self.cut(image, found)
 
-    def cut(self, image: Image, found: TrackedFace) -> tuple[Picture, Crop]:
+    def cut(self, image: Image, found: TrackedFace) -> Picture:
         crop = head_crop(self.finder.head, found.coefficients, found.camera)
         pixels, _ = crop.cut(image)
         landmarks = landmarks68(found.landmarks)[:, :2] - (crop.left, crop.top)
         # The finder counts the first pixel's centre as 0.5, the released code as 0.
-        return Picture(pixels, landmarks * (CROP_PIXELS / crop.size) - 0.5), crop
+        return Picture(pixels, landmarks * (CROP_PIXELS / crop.size) - 0.5, crop)
 
     @torch.inference_mode()
     def estimate(self, pixels: Image, square: FaceSquare) -> Estimate:

@@ -150,6 +150,9 @@ ALLOWED: dict[str, Callable[..., object]] = {
     # The third argument of copyreg._reconstructor; an instance of it holds nothing.
     "builtins.object": object,
     "__builtin__.object": object,
+    # Chumpy keeps a set of names beside each array.
+    "builtins.set": Ignored,
+    "__builtin__.set": Ignored,
 }
 for _core in ("numpy.core.multiarray", "numpy._core.multiarray"):
     ALLOWED[f"{_core}._reconstruct"] = _new_record
