@@ -75,7 +75,8 @@ class Composer:
         # Colours are meaningless where alpha is 0: they would only make a file larger, and must
         # not be mixed in when the size changes.
         if self.size == CROP_PIXELS:
-            return frame.rgba() * (frame.alpha > 0)[..., None]
+            drawn = cv2.copyTo(frame.rgb, frame.alpha).astype(np.uint8, copy=False)
+            return Frame(drawn, frame.alpha).rgba()
         alpha = frame.alpha[..., None].astype(np.float32) / 255
         layers = np.concatenate([frame.rgb * alpha, alpha * 255], axis=2)
         layers = _resize(layers, self.size)

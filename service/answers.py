@@ -7,9 +7,9 @@ from typing import Self
 
 from pydantic import BaseModel, Field
 
-from cvthead.avatar import Avatar
 from cvthead.camera import Camera
 from cvthead.coefficients import JOINTS, Array, Coefficients
+from cvthead.preset import AnyAvatar
 from cvthead.record import AvatarRecord
 from cvthead.tracking.tracker import TrackedFace
 
@@ -114,7 +114,7 @@ class AvatarInfo(AvatarSummary):
     source: SourceInfo
 
     @classmethod
-    def about(cls, record: AvatarRecord, path: str, avatar: Avatar) -> Self:
+    def about(cls, record: AvatarRecord, path: str, avatar: AnyAvatar) -> Self:
         coefficients = avatar.coefficients
         source = SourceInfo(
             shape=listed(coefficients.shape),

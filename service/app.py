@@ -13,7 +13,7 @@ from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
 from cvthead.cache import AvatarCache
-from cvthead.pipeline import Pipeline
+from cvthead.preset import load_preset
 from service import health, middleware, models, problems
 from service.engine import Engine
 from service.keys import KeyRing, Tickets
@@ -21,6 +21,7 @@ from service.limits import RateLimiter
 from service.metrics import CacheCollector, Metrics
 from service.routers import avatars, page, render, stream, tickets, track
 from service.settings import Settings
+from service.signing import StillSigner
 from service.state import Service
 from service.warmup import warm_up
 
@@ -39,7 +40,7 @@ def create_app(settings: Settings) -> FastAPI:
 
     Raises:
         AssetError: networks are missing or altered.
-        InputError: the store's folder cannot be made.
+        InputError: the store's folder cannot be made, or stills cannot be signed.
     """
     service = build(settings)
     app = FastAPI(
@@ -63,9 +64,8 @@ def create_app(settings: Settings) -> FastAPI:
 
 def build(settings: Settings) -> Service:
     """The parts of the service, loaded and warm, no thread or task started yet."""
-    pipeline = Pipeline.load(
-        settings.preset, model=settings.model, threads=settings.threads or None
-    )
+    signer = _signer(settings)  # first, because it can fail at once
+    pipeline = load_preset(settings.preset, model=settings.model, threads=settings.threads or None)
     warm_up(pipeline)
     metrics = Metrics()
     metrics.build.info(
@@ -97,7 +97,15 @@ def build(settings: Settings) -> Service:
         KeyRing(settings.keys),
         Tickets(settings.ticket_seconds),
         RateLimiter(settings.rate_limit),
+        signer,
     )
+
+
+def _signer(settings: Settings) -> StillSigner | None:
+    certificates, private_key = settings.c2pa_certificates, settings.c2pa_private_key
+    if certificates is None or private_key is None:
+        return None
+    return StillSigner(certificates, private_key)
 
 
 @asynccontextmanager

@@ -22,7 +22,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument("--host", help="address to listen on (default: 127.0.0.1)")
     parser.add_argument("--port", type=int, help="port, 0 = a free one (default: 8000)")
     parser.add_argument("--store", type=Path, help="folder of the avatars (default: avatars)")
-    parser.add_argument("--preset", help="model to use (default and only one: open)")
+    parser.add_argument("--preset", help="model to use: open (default) or official")
     parser.add_argument("--model", type=Path, help="folder of another model of the preset")
     parser.add_argument("--threads", type=int, help="threads of each network (default: the cores)")
     parser.add_argument("--log-level", help="debug, info, warning or error (default: info)")

@@ -10,19 +10,18 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cvthead.avatar import Avatar
 from cvthead.camera import Camera
 from cvthead.coefficients import Array, Coefficients
 from cvthead.composite import Background, Composer
 from cvthead.frame import Frame
-from cvthead.head.model import HeadModel
+from cvthead.head.model import HeadModel, Region
 from cvthead.images import ImageFormat, decode_image, encode_image
-from cvthead.pipeline import Pipeline
+from cvthead.preset import AnyAvatar, Preset
 from cvthead.provenance import SourceType
 from cvthead.record import Box
 from cvthead.tracking.tracker import FaceTurnedWarning, TrackedFace
@@ -63,7 +62,7 @@ class Output:
 class RenderJob:
     """One frame of an avatar: full coefficients, normalised camera."""
 
-    avatar: Avatar
+    avatar: AnyAvatar
     coefficients: Coefficients
     camera: Camera
     output: Output
@@ -113,7 +112,7 @@ class Engine:
 
     def __init__(
         self,
-        pipeline: Pipeline,
+        pipeline: Preset[Any],
         metrics: Metrics,
         *,
         encode_queue: int,
@@ -178,13 +177,13 @@ class Engine:
 
     async def encode(
         self, image: NDArray[np.uint8], *, face: int | None = None, only_one: bool = False
-    ) -> tuple[Avatar, Box]:
+    ) -> tuple[AnyAvatar, Box]:
         """``Pipeline.encode``, and the box of the face in pixels of the image.
 
         Raises:
             ImageError, FaceError: as there.
         """
-        result: tuple[Avatar, Box] = await self._encoding.submit(_Encode(image, face, only_one))
+        result: tuple[AnyAvatar, Box] = await self._encoding.submit(_Encode(image, face, only_one))
         return result
 
     async def track(
@@ -270,7 +269,7 @@ class Engine:
             timings[name] = seconds * 1000
 
 
-def picture(pipeline: Pipeline, job: RenderJob, frame: Frame) -> tuple[bytes, SourceType]:
+def picture(pipeline: Preset[Any], job: RenderJob, frame: Frame) -> tuple[bytes, SourceType]:
     """The file of a frame, and what its AI-generated mark says."""
     output = job.output
     own = pipeline.background(job.avatar) if output.background == "source" else NO_BACKGROUND
@@ -282,10 +281,13 @@ def picture(pipeline: Pipeline, job: RenderJob, frame: Frame) -> tuple[bytes, So
     return data, composer.source
 
 
-def face_box(head: HeadModel, avatar: Avatar) -> Box:
-    """Left, top, right, bottom of the fitted face landmarks in pixels of the portrait."""
-    landmarks = avatar.camera.project(head.landmarks(head.vertices(avatar.coefficients)))[:, :2]
+def face_box(head: HeadModel, avatar: AnyAvatar) -> Box:
+    """Left, top, right, bottom of the fitted face in pixels of the portrait: of its landmarks, or
+    of its region where the head model has none of them (FLAME)."""
+    vertices = head.vertices(avatar.coefficients)
+    has_landmarks = len(head.landmark_faces) > 0
+    face = head.landmarks(vertices) if has_landmarks else vertices[head.region == Region.FACE]
     crop = avatar.crop
-    pixels = (landmarks + 1) / 2 * crop.size + (crop.left, crop.top)
+    pixels = (avatar.camera.project(face)[:, :2] + 1) / 2 * crop.size + (crop.left, crop.top)
     low, high = pixels.min(axis=0), pixels.max(axis=0)
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])

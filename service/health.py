@@ -39,7 +39,7 @@ async def ready(service: ServiceDep) -> Health:
     """Weights are loaded and a warm-up render is done before the first request is taken; this
     checks that the store can be written and that the service is not stopping."""
     if service.draining:
-        raise Problem("draining")
+        raise Problem("draining", headers={"Retry-After": "1"})
     if not await asyncio.to_thread(writable, service.cache.folder):
         raise Problem("not_ready")
     return Health(status="ready")

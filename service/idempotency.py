@@ -102,8 +102,8 @@ class Idempotency:
                     path.unlink()
 
 
-def idempotency(request: Request) -> Idempotency:
-    """The application's; a FastAPI dependency."""
+async def idempotency(request: Request) -> Idempotency:
+    """The application's; a FastAPI dependency. A coroutine, so that two requests make no two."""
     state = request.app.state
     if not hasattr(state, "idempotency"):
         state.idempotency = Idempotency(get_service(request).cache.folder / "idempotency")

@@ -6,8 +6,8 @@ no bodies, no coefficients.
 
 from __future__ import annotations
 
-import logging
 import logging.config
+import sys
 from typing import Any
 
 import structlog
@@ -23,7 +23,7 @@ def configure(level: str, log_format: str) -> None:
     """
     shared: list[Processor] = [
         structlog.contextvars.merge_contextvars,
-        structlog.stdlib.add_log_level,
+        structlog.processors.add_log_level,
         structlog.processors.TimeStamper(fmt="iso", utc=True),
     ]
     last: list[Any] = (
@@ -36,13 +36,12 @@ def configure(level: str, log_format: str) -> None:
             )
         ]
     )
+    # Straight to the stream: the standard library's way there takes twice the time, and every
+    # request writes a line.
     structlog.configure(
-        processors=[
-            structlog.stdlib.filter_by_level,
-            *shared,
-            structlog.stdlib.ProcessorFormatter.wrap_for_formatter,
-        ],
-        logger_factory=structlog.stdlib.LoggerFactory(),
+        processors=[*shared, *last],
+        wrapper_class=structlog.make_filtering_bound_logger(level),
+        logger_factory=structlog.WriteLoggerFactory(sys.stderr),
         cache_logger_on_first_use=True,
     )
     formatter = {
@@ -57,9 +56,6 @@ def configure(level: str, log_format: str) -> None:
             "formatters": {"structured": formatter},
             "handlers": {"stderr": {"class": "logging.StreamHandler", "formatter": "structured"}},
             "root": {"handlers": ["stderr"], "level": "WARNING"},
-            "loggers": {
-                "cvthead": {"level": level.upper()},
-                "uvicorn": {"level": "WARNING"},
-            },
+            "loggers": {"uvicorn": {"level": "WARNING"}},
         }
     )

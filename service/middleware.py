@@ -5,6 +5,7 @@ Plain ASGI: Starlette's BaseHTTPMiddleware would copy bodies and hide disconnect
 
 from __future__ import annotations
 
+import asyncio
 import re
 import secrets
 import time
@@ -41,7 +42,9 @@ log = structlog.get_logger("cvthead")
 
 def install(app: FastAPI, settings: Settings) -> None:
     """Put the middleware around the application; the first one listed here is the innermost."""
-    app.add_middleware(BodyLimit, max_bytes=settings.max_body_bytes)
+    app.add_middleware(
+        BodyLimit, max_bytes=settings.max_body_bytes, seconds=settings.receive_seconds
+    )
     app.add_middleware(Gate, settings=settings)
     app.add_middleware(Context)
     if settings.cors_origins:
@@ -203,11 +206,13 @@ class Gate:
 
 
 class BodyLimit:
-    """Refuses bodies over a size: declared ones at once, others as soon as they exceed it."""
+    """Refuses bodies over a size: declared ones at once, others as soon as they exceed it. And
+    bodies that take too long to arrive, counted from when the application begins to read."""
 
-    def __init__(self, app: ASGIApp, max_bytes: int) -> None:
+    def __init__(self, app: ASGIApp, max_bytes: int, seconds: float) -> None:
         self.app = app
         self.max_bytes = max_bytes
+        self.seconds = seconds
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -224,14 +229,24 @@ class BodyLimit:
         if len(declared) > 18 or (declared.isdecimal() and int(declared) > self.max_bytes):
             await problem.response(HTTPConnection(scope))(scope, receive, send)
             return
-        received = 0
+        received, more = 0, True
+        deadline: float | None = None
 
-        async def counted() -> Message:
-            nonlocal received
-            message = await receive()
+        async def limited() -> Message:
+            nonlocal received, more, deadline
+            if not more:  # what may come now is that the client leaves, which has no time limit
+                return await receive()
+            deadline = deadline or asyncio.get_running_loop().time() + self.seconds
+            try:
+                async with asyncio.timeout_at(deadline):
+                    message = await receive()
+            except TimeoutError:
+                headers = {"Connection": "close"}
+                raise Problem("request_timeout", headers=headers) from None
+            more = message.get("more_body", False)
             received += len(message.get("body", b""))
             if received > self.max_bytes:
                 raise problem
             return message
 
-        await self.app(scope, counted, send)
+        await self.app(scope, limited, send)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib.metadata import version
+from typing import Self
 
 from fastapi import APIRouter
 from pydantic import BaseModel, Field
@@ -10,18 +11,33 @@ from pydantic import BaseModel, Field
 from cvthead.camera import CROP_PIXELS
 from cvthead.coefficients import EXPRESSION_SIZE, JOINTS, SHAPE_SIZE
 from cvthead.head.arkit import ARKIT_NAMES
+from cvthead.official.manifest import HEAD_PART, LICENCES, WEIGHTS_PART
 from service.state import ServiceDep
 
 router = APIRouter()
 
 
 class Licences(BaseModel):
-    """SPDX identifiers; NOTICE has the sources."""
+    """SPDX identifiers where there is one; NOTICE and docs/official.md have the sources."""
 
     code: str = Field(default="Apache-2.0", description="Of the software.")
     weights: str = Field(default="Apache-2.0", description="Of the trained weights.")
-    head: str = Field(default="CC0-1.0", description="Of the head model (MakeHuman).")
+    head: str = Field(default="CC0-1.0", description="Of the head model (MakeHuman, or FLAME).")
     networks: str = Field(default="Apache-2.0", description="Of the face networks (MediaPipe).")
+    imported: dict[str, str] = Field(
+        default={}, description="Of the parts that the official preset was imported from."
+    )
+
+    @classmethod
+    def of(cls, preset: str) -> Self:
+        """
+        Args:
+            preset: that is loaded.
+        """
+        if preset != "official":
+            return cls()
+        imported = {licence.part: licence.licence for licence in LICENCES}
+        return cls(weights=imported[WEIGHTS_PART], head=imported[HEAD_PART], imported=imported)
 
 
 class ModelInfo(BaseModel):
@@ -59,6 +75,6 @@ async def models(service: ServiceDep) -> Models:
         expression=EXPRESSION_SIZE,
         pose=list(JOINTS),
         arkit=list(ARKIT_NAMES),
-        licences=Licences(),
+        licences=Licences.of(pipeline.preset),
     )
     return Models(items=[info])

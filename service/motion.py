@@ -8,12 +8,12 @@ from dataclasses import replace
 from cvthead_client.hello import Hello
 from cvthead_client.wire import CoefficientFrame, Kind, Message, unpack_coefficients
 
-from cvthead.avatar import Avatar
 from cvthead.camera import Camera, Crop
 from cvthead.coefficients import JOINTS, Coefficients
 from cvthead.controls import Controls, resolve
 from cvthead.crop import head_crop
 from cvthead.driving import drive
+from cvthead.preset import AnyAvatar
 from cvthead.tracking.one_euro import FaceFilter
 from cvthead.tracking.tracker import TrackedFace
 from service.engine import Engine
@@ -27,7 +27,7 @@ FRAME_SECONDS = 1 / 30
 class Motion:
     """Follows one driver through a stream."""
 
-    def __init__(self, engine: Engine, avatar: Avatar, hello: Hello) -> None:
+    def __init__(self, engine: Engine, avatar: AnyAvatar, hello: Hello) -> None:
         self._engine = engine
         self._avatar = avatar
         self._hello = hello

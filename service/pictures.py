@@ -7,16 +7,17 @@ from typing import Any
 from starlette.requests import Request
 from starlette.responses import Response
 
-from cvthead.avatar import Avatar
 from cvthead.camera import Camera
 from cvthead.coefficients import Coefficients
 from cvthead.composite import background
 from cvthead.images import ImageFormat
+from cvthead.preset import AnyAvatar
 from service.engine import Output, Rendered, RenderJob
 from service.middleware import server_timing
 from service.negotiation import IMAGE_TYPES
 from service.problems import responses
 from service.schemas import PictureOptions, invalid
+from service.signing import signed
 from service.state import Service
 from service.waiting import unless_gone
 
@@ -26,6 +27,7 @@ AVATAR = ("avatar_not_found", "avatar_expired", "invalid_avatar_file")
 PICTURE = (*AVATAR, "model_changed", "not_acceptable", "invalid_request", "overloaded")
 UPLOAD = (
     "malformed_body",
+    "request_timeout",
     "body_too_large",
     "image_too_large",
     "unsupported_media_type",
@@ -69,7 +71,7 @@ def output_of(
 async def send_frame(
     request: Request,
     service: Service,
-    avatar: Avatar,
+    avatar: AnyAvatar,
     pose: tuple[Coefficients, Camera],
     output: Output,
     timings: dict[str, float] | None = None,
@@ -81,6 +83,7 @@ async def send_frame(
     """
     job = RenderJob(avatar, *pose, output)
     rendered = await unless_gone(request, service.engine.render(job))
+    rendered = await signed(service.signer, rendered)
     return Response(
         rendered.data,
         media_type=rendered.media_type,

@@ -17,6 +17,12 @@ class Kind:
 
 
 PROBLEMS: Mapping[str, Kind] = {
+    "malformed_request": Kind(
+        400,
+        "Not HTTP",
+        "The request line or the headers are not HTTP/1.1.",
+        "Let an HTTP library write the request.",
+    ),
     "invalid_json": Kind(
         400, "Not JSON", "The body is not well-formed JSON.", "Correct the body's syntax."
     ),
@@ -56,6 +62,12 @@ PROBLEMS: Mapping[str, Kind] = {
         "No acceptable format",
         "None of the formats in Accept can be made.",
         "Accept image/png, image/jpeg or image/webp.",
+    ),
+    "request_timeout": Kind(
+        408,
+        "Request came too slowly",
+        "The headers or the body did not arrive within `receive_seconds`.",
+        "Send a smaller picture, or use a faster connection.",
     ),
     "model_changed": Kind(
         409,
@@ -130,7 +142,7 @@ PROBLEMS: Mapping[str, Kind] = {
     "face_turned_away": Kind(
         422,
         "Face turned away",
-        "The face is covered or seen from the side.",
+        "The face is covered, upside down or seen from the side.",
         "Use a portrait seen from the front.",
     ),
     "face_error": Kind(
@@ -153,6 +165,12 @@ PROBLEMS: Mapping[str, Kind] = {
         "Too many requests",
         "More requests than `rate_limit` within a minute.",
         "Retry after the time in Retry-After.",
+    ),
+    "headers_too_large": Kind(
+        431,
+        "Headers too large",
+        "The request line and the headers are larger than 64 KiB.",
+        "Send fewer or shorter headers.",
     ),
     "internal": Kind(
         500,

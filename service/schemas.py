@@ -6,13 +6,13 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from cvthead.avatar import Avatar
 from cvthead.camera import Camera
 from cvthead.coefficients import EXPRESSION_SIZE, JOINTS, SHAPE_SIZE
 from cvthead.controls import FIELDS, Controls, Mode
 from cvthead.errors import CoefficientsError
 from cvthead.head.arkit import ARKIT_NAMES
 from cvthead.images import ImageFormat
+from cvthead.preset import AnyAvatar
 from service.problems import Problem
 
 SHAPE_LIMIT, EXPRESSION_LIMIT = 20.0, 50.0  # standard deviations, as cvthead.coefficients has them
@@ -176,7 +176,7 @@ class FrameControls(BaseModel):
         examples=["relative"],
     )
 
-    def controls(self, avatar: Avatar) -> Controls:
+    def controls(self, avatar: AnyAvatar) -> Controls:
         """As the core takes them.
 
         Raises:
@@ -276,7 +276,7 @@ def invalid(where: str, pointer: str, message: str) -> Problem:
     return Problem("invalid_request", f"{where} {pointer}: {message}", errors=[error])
 
 
-def checked_controls(frame: FrameControls, avatar: Avatar, pointer: str = "") -> Controls:
+def checked_controls(frame: FrameControls, avatar: AnyAvatar, pointer: str = "") -> Controls:
     """``frame.controls``, with the frame's place in the message of an error."""
     try:
         return frame.controls(avatar)

@@ -13,6 +13,7 @@ import uvicorn
 
 from service import logs
 from service.app import create_app
+from service.protocol import LimitedProtocol
 from service.settings import Settings
 from service.state import Service
 
@@ -30,7 +31,7 @@ def serve(settings: Settings, bound: socket.socket, banner: str) -> None:
     app = create_app(settings)
     config = uvicorn.Config(
         app,
-        http="auto",
+        http=LimitedProtocol,
         ws="websockets-sansio",
         ws_max_size=MAX_WEBSOCKET_MESSAGE,
         ws_per_message_deflate=False,  # pictures do not get smaller

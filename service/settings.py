@@ -62,9 +62,13 @@ class Settings(BaseSettings):
         description="Refuse an upload that does not say `consent=true`. Default: as soon as "
         "keys are set.",
     )
-    preset: Literal["open"] = Field("open", description="Model to load.")
+    preset: Literal["open", "official"] = Field(
+        "open", description="Model to load: `open`, or `official` after `cvthead import-official`."
+    )
     model: Path | None = Field(
-        None, description="Folder of another model of the preset than the packaged one."
+        None,
+        description="Folder of another model of the preset than the packaged (`official`: the "
+        "imported) one.",
     )
     threads: int = Field(
         0,
@@ -92,6 +96,13 @@ class Settings(BaseSettings):
     )
     max_body_bytes: int = Field(
         20 * 10**6, ge=1024, description="Largest request body, counted while it is received."
+    )
+    receive_seconds: float = Field(
+        60,
+        gt=0,
+        le=3600,
+        description="Longest time for a request's headers, and again for its body, to arrive; then "
+        "408 `request_timeout`.",
     )
     encode_queue: int = Field(
         8, ge=1, description="Uploads that may wait; one more gets 503 `overloaded`."
@@ -131,6 +142,14 @@ class Settings(BaseSettings):
         False,
         description="Serve the interactive API page `/docs`. The browser loads its scripts from "
         "cdn.jsdelivr.net; everything else works offline.",
+    )
+    c2pa_certificates: Path | None = Field(
+        None,
+        description="PEM file of the certificate chain with which stills are signed as C2PA "
+        "describes; needs the extra `c2pa`. Default: they are not signed.",
+    )
+    c2pa_private_key: Path | None = Field(
+        None, description="PEM file of the private key of the first certificate, not encrypted."
     )
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         "info", description="Least severe log lines to write."
@@ -194,6 +213,8 @@ class Settings(BaseSettings):
     def _consistent(self) -> Self:
         if self.lifetime_seconds > self.lifetime_max_seconds:
             raise ValueError("lifetime_seconds is longer than lifetime_max_seconds")
+        if (self.c2pa_certificates is None) != (self.c2pa_private_key is None):
+            raise ValueError("c2pa_certificates and c2pa_private_key go together")
         if not (self.on_loopback or self.keys or self.open_network):
             raise ValueError(
                 f"{self.host} can be reached from other machines and no keys are set; set "

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import asyncio
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from fastapi import Depends
 from starlette.requests import HTTPConnection
 
 from cvthead.cache import AvatarCache
-from cvthead.pipeline import Pipeline
+from cvthead.preset import Preset
 from service.keys import KeyRing, Tickets
 from service.limits import RateLimiter
 from service.metrics import Metrics
@@ -18,6 +18,7 @@ from service.settings import Settings
 
 if TYPE_CHECKING:
     from service.engine import Engine
+    from service.signing import StillSigner
 
 
 @dataclass(eq=False)
@@ -25,19 +26,21 @@ class Service:
     """Everything that lives as long as the application.
 
     Attributes:
+        signer: of the stills that are sent; None where they are not signed.
         stopping: set when SIGTERM arrives; streams wait for it and close with 1001.
         in_flight: HTTP requests and streams being answered.
         open_streams: WebSocket streams that were admitted.
     """
 
     settings: Settings
-    pipeline: Pipeline
+    pipeline: Preset[Any]
     cache: AvatarCache
     engine: Engine
     metrics: Metrics
     keys: KeyRing
     tickets: Tickets
     limiter: RateLimiter
+    signer: StillSigner | None = None
     stopping: asyncio.Event = field(default_factory=asyncio.Event)
     in_flight: int = 0
     open_streams: int = 0
@@ -49,9 +52,14 @@ class Service:
 
 
 def get_service(connection: HTTPConnection) -> Service:
-    """The service of a request or WebSocket; a FastAPI dependency."""
+    """The service of a request or WebSocket."""
     service: Service = connection.app.state.service
     return service
 
 
-ServiceDep = Annotated[Service, Depends(get_service)]
+async def _provided(connection: HTTPConnection) -> Service:
+    # A coroutine, because FastAPI calls plain functions in a thread.
+    return get_service(connection)
+
+
+ServiceDep = Annotated[Service, Depends(_provided)]

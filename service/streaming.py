@@ -19,9 +19,9 @@ from cvthead_client.hello import CODECS, Hello
 from cvthead_client.wire import Codec, Kind, Message, Stats
 from fastapi import WebSocket, WebSocketDisconnect
 
-from cvthead.avatar import Avatar
 from cvthead.composite import background
 from cvthead.errors import FaceError
+from cvthead.preset import AnyAvatar
 from service.engine import Output, RenderJob
 from service.mailbox import Mailbox, Window
 from service.motion import Motion
@@ -44,7 +44,7 @@ class Session:
     socket: WebSocket
     owner: str
     avatar_id: str
-    avatar: Avatar
+    avatar: AnyAvatar
     hello: Hello
     stats: Stats = field(default_factory=Stats)
     # The newest frame that the counts include.

@@ -102,7 +102,7 @@ class Worker:
             rest, self._items = self._items, deque()
         for item in rest:
             if item.future.set_running_or_notify_cancel():
-                item.future.set_exception(Problem("draining"))
+                item.future.set_exception(Problem("draining", headers={"Retry-After": "1"}))
         if self._thread.is_alive():
             self._thread.join(max(0.0, deadline - time.monotonic()))
 

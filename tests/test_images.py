@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image, ImageCms
+from PIL.PngImagePlugin import PngImageFile
 
 from cvthead.errors import ImageError
 from cvthead.images import decode_image, encode_image, on_white, read_image, shrink
@@ -317,8 +318,19 @@ def test_alpha_survives_in_png_and_webp() -> None:
             assert np.array_equal(np.asarray(opened)[..., 3], image[..., 3])
 
 
+@pytest.mark.parametrize("shape", [(1, 1, 3), (7, 5, 3), (64, 48, 4), (300, 1, 4)])
+def test_png_is_lossless(shape: tuple[int, int, int]) -> None:
+    noise = np.random.default_rng(3).integers(0, 256, shape, np.uint8)
+    for image in (noise, np.full(shape, 200, np.uint8), noise[::-1, ::-1]):
+        with PngImageFile(BytesIO(encode_image(image))) as opened:
+            opened.verify()  # checksums
+        with Image.open(BytesIO(encode_image(image))) as opened:
+            assert np.array_equal(np.asarray(opened), image)
+
+
 def test_encode_image_refuses_what_it_cannot_encode() -> None:
-    for wrong in (np.zeros((8, 8), np.uint8), np.zeros((8, 8, 3), np.float32)):
+    wrong_shape, no_pixels = np.zeros((8, 8), np.uint8), np.zeros((0, 8, 3), np.uint8)
+    for wrong in (wrong_shape, no_pixels, np.zeros((8, 8, 3), np.float32)):
         with pytest.raises(ImageError, match="cannot encode an array"):
             encode_image(wrong)  # type: ignore[arg-type]
     with pytest.raises(ImageError, match="as webp"):

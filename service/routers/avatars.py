@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 
-from cvthead.avatar import Avatar
 from cvthead.errors import AvatarExpiredError, AvatarFileError, AvatarNotFoundError
+from cvthead.preset import AnyAvatar
 from cvthead.record import AvatarRecord, Box
 from service.answers import EXAMPLE_ID, AvatarInfo, AvatarPage, AvatarSummary
 from service.bodies import image_body, read_upload
@@ -188,12 +188,14 @@ async def preview(
     return await send_frame(request, service, avatar, pose, output)
 
 
-async def load(service: Service, tenant: Tenant, avatar_id: str) -> Avatar:
+async def load(service: Service, tenant: Tenant, avatar_id: str) -> AnyAvatar:
     """The tenant's avatar, from memory or disk.
 
     Raises:
         AvatarNotFoundError, AvatarExpiredError, AvatarFileError
     """
+    if service.cache.in_memory(avatar_id):  # a thread would take longer than the look-up
+        return service.cache.get(avatar_id, owner=tenant.name)
     return await asyncio.to_thread(service.cache.get, avatar_id, owner=tenant.name)
 
 
@@ -207,11 +209,11 @@ def _check(options: PortraitOptions, service: Service) -> None:
 
 async def _make(
     request: Request, service: Service, tenant: Tenant, data: bytes, options: PortraitOptions
-) -> tuple[AvatarRecord, Avatar]:
+) -> tuple[AvatarRecord, AnyAvatar]:
     if await asyncio.to_thread(service.cache.count) >= service.settings.store_max_avatars:
         raise Problem("store_full")
 
-    async def encoded() -> tuple[Avatar, Box]:
+    async def encoded() -> tuple[AnyAvatar, Box]:
         image = await service.engine.decode(data)
         return await service.engine.encode(image, face=options.face, only_one=options.face is None)
 
@@ -224,7 +226,9 @@ async def _make(
     return record, avatar
 
 
-def _earlier(service: Service, tenant: Tenant, claim: Claim) -> tuple[AvatarRecord, Avatar] | None:
+def _earlier(
+    service: Service, tenant: Tenant, claim: Claim
+) -> tuple[AvatarRecord, AnyAvatar] | None:
     """What an earlier request with the same key made, if it is still there."""
     if claim.result is None:
         return None
@@ -240,7 +244,7 @@ def _fingerprint(data: bytes, options: PortraitOptions) -> str:
 
 
 def _described(
-    request: Request, record: AvatarRecord, avatar: Avatar, *, created: bool = False
+    request: Request, record: AvatarRecord, avatar: AnyAvatar, *, created: bool = False
 ) -> Response:
     path = _path(request, record.id)
     body = AvatarInfo.about(record, path, avatar).model_dump_json(by_alias=True).encode()

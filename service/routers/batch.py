@@ -10,11 +10,11 @@ from fastapi import APIRouter, Request, Response
 from starlette.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
-from cvthead.avatar import Avatar
 from cvthead.camera import Camera
 from cvthead.coefficients import Coefficients
 from cvthead.controls import resolve
 from cvthead.head.arkit import ArkitMap
+from cvthead.preset import AnyAvatar
 from cvthead.provenance import SourceType
 from service.bodies import json_body, read_json
 from service.containers import MULTIPART_TYPE, PARTS, VIDEO_TYPE, Frames, Parts, video
@@ -26,6 +26,7 @@ from service.pictures import COMMON, HEADERS, PICTURE, output_of
 from service.problems import responses
 from service.routers.avatars import AvatarId, load
 from service.schemas import BatchRequest, checked_controls, invalid
+from service.signing import all_signed
 from service.state import ServiceDep
 from service.waiting import unless_gone
 
@@ -60,6 +61,7 @@ class Streamed(StreamingResponse):
         *PICTURE,
         "invalid_json",
         "invalid_coefficients",
+        "request_timeout",
         "body_too_large",
         "unsupported_media_type",
         *COMMON,
@@ -87,7 +89,7 @@ async def batch(
         file = await unless_gone(request, video(frames, output.size, wanted.fps, source))
         return Streamed(file.chunks(), headers=headers, media_type=VIDEO_TYPE)
     parts: Parts = PARTS[kind]()
-    started = await unless_gone(request, _started(frames))
+    started = await unless_gone(request, _started(all_signed(service.signer, frames)))
     return Streamed(parts.stream(started), headers=headers, media_type=parts.media_type)
 
 
@@ -103,7 +105,7 @@ def _output(wanted: BatchRequest, kind: str) -> Output:
 
 
 def _poses(
-    wanted: BatchRequest, avatar: Avatar, arkit: ArkitMap
+    wanted: BatchRequest, avatar: AnyAvatar, arkit: ArkitMap
 ) -> list[tuple[Coefficients, Camera]]:
     """All at once, so that a mistake in the last frame is found before the first is sent."""
     controls = [checked_controls(f, avatar, f"frames/{i}") for i, f in enumerate(wanted.frames)]

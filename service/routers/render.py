@@ -37,6 +37,7 @@ router.include_router(batch.router)
         *PICTURE,
         "invalid_json",
         "invalid_coefficients",
+        "request_timeout",
         "body_too_large",
         "unsupported_media_type",
         description="The picture.",

@@ -11,8 +11,8 @@ from cvthead_client.errors import WireError
 from cvthead_client.hello import Hello, Welcome, error_json
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
 
-from cvthead.avatar import Avatar
 from cvthead.errors import CVTHeadError, ModelChangedError
+from cvthead.preset import AnyAvatar
 from cvthead.provenance import SourceType
 from service.keys import Tenant, authenticated, origin_allowed
 from service.problems import Problem, from_core
@@ -87,7 +87,7 @@ def _counted(service: Service) -> Iterator[None]:
         service.metrics.streams.dec()
 
 
-def _avatar(service: Service, avatar_id: str, tenant: Tenant) -> Avatar:
+def _avatar(service: Service, avatar_id: str, tenant: Tenant) -> AnyAvatar:
     avatar = service.cache.get(avatar_id, owner=tenant.name)
     if avatar.fingerprint != service.pipeline.fingerprint:
         raise ModelChangedError(

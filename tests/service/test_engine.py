@@ -19,7 +19,6 @@ from cvthead.pipeline import Pipeline
 from cvthead.provenance import read_mark
 from service.engine import Engine, Output, RenderJob
 from service.metrics import Metrics
-from service.warmup import nobody
 
 
 @pytest.fixture(scope="module")
@@ -60,10 +59,11 @@ def test_renders_of_several_avatars_are_painted_together(
 ) -> None:
     """Alone or in company, an avatar's picture is the same; one that fails fails alone."""
     old = replace(avatar, fingerprint="0" * 16)
+    nobody = replace(avatar, drawn=np.zeros_like(avatar.drawn))
 
     async def work(engine: Engine, metrics: Metrics) -> None:
         first = await engine.render(job_of(avatar))
-        jobs = [job_of(a) for a in (avatar, nobody(pipeline), old, avatar, avatar)]
+        jobs = [job_of(a) for a in (avatar, nobody, old, avatar, avatar)]
         # The first of them occupies the thread, so that the others queue.
         results = await asyncio.gather(*map(engine.render, jobs), return_exceptions=True)
         assert isinstance(results.pop(2), ModelChangedError)

@@ -73,7 +73,7 @@ def test_loopback_needs_no_keys(host: str) -> None:
         ("log_level", "loud"),
         ("lifetime_seconds", "nan"),
         ("drain_seconds", "inf"),
-        ("preset", "official"),
+        ("preset", "paper"),
         ("allowed_hosts", "a*.example.com"),
     ],
 )

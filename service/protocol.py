@@ -1,0 +1,99 @@
+"""HTTP/1.1 on a socket: uvicorn's protocol with limits on slow and on endless requests."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+from typing import Any
+
+from uvicorn.config import Config
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+from uvicorn.server import ServerState
+
+from service.problems import Problem
+
+MAX_HEAD_BYTES = 2**16
+# The application itself answers a slow body (service/middleware.py); it gets this long for it.
+GRACE_SECONDS = 5.0
+
+
+class LimitedProtocol(HttpToolsProtocol):
+    """Gives a request's head, and then its body, ``receive_seconds`` to arrive.
+
+    Without a limit, clients that send a byte now and then hold connections for ever. What cannot
+    be read is answered here, because no application is called for it; uvicorn alone would answer
+    in plain text.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        server_state: ServerState,
+        app_state: dict[str, Any],
+        _loop: asyncio.AbstractEventLoop | None = None,
+    ) -> None:
+        super().__init__(config, server_state, app_state, _loop)
+        self._seconds: float = config.app.state.service.settings.receive_seconds  # type: ignore[union-attr]
+        self._timer: asyncio.TimerHandle | None = None
+        self._head_bytes = 0
+        self._in_head = False
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self._limit(self._seconds)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._limit(None)
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        if self._timer is None:  # also for empty lines, with which no request begins
+            self._limit(self._seconds)
+        super().data_received(data)
+        if self._in_head and not self.transport.is_closing():
+            self._head_bytes += len(data)
+            if self._head_bytes > MAX_HEAD_BYTES:
+                self._refuse(Problem("headers_too_large"))
+
+    def on_message_begin(self) -> None:
+        super().on_message_begin()
+        self._in_head, self._head_bytes = True, 0
+        if self._timer is None:  # the request was sent together with the one before
+            self._limit(self._seconds)
+
+    def on_headers_complete(self) -> None:
+        self._in_head = False
+        super().on_headers_complete()
+        self._limit(self._seconds + GRACE_SECONDS)
+
+    def on_message_complete(self) -> None:
+        self._limit(None)
+        super().on_message_complete()
+
+    def handle_websocket_upgrade(self) -> None:
+        self._limit(None)
+        super().handle_websocket_upgrade()
+
+    def send_400_response(self, msg: str) -> None:
+        self._refuse(Problem("malformed_request"))
+
+    def _limit(self, seconds: float | None) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = None if seconds is None else self.loop.call_later(seconds, self._too_slow)
+
+    def _too_slow(self) -> None:
+        if self._in_head:
+            self._refuse(Problem("request_timeout"))
+        else:  # nothing was asked, or the answer is already given
+            self.transport.close()
+
+    def _refuse(self, problem: Problem) -> None:
+        if self.cycle is None or self.cycle.response_complete:
+            response = problem.plain_response("", secrets.token_hex(8), {"Connection": "close"})
+            head = f"HTTP/1.1 {response.status_code} {problem.title}\r\n".encode()
+            fields = b"".join(
+                name + b": " + value + b"\r\n" for name, value in response.raw_headers
+            )
+            self.transport.write(head + fields + b"\r\n" + bytes(response.body))
+        self.transport.close()
