@@ -230,6 +230,8 @@ class InternalServiceError(ServiceError):
 BY_CODE: Mapping[str, type[ServiceError]] = {
     "invalid_request": InvalidRequestError,
     "invalid_json": InvalidRequestError,
+    "malformed_request": InvalidRequestError,
+    "headers_too_large": InvalidRequestError,
     "malformed_body": InvalidRequestError,
     "not_acceptable": InvalidRequestError,
     "not_found": InvalidRequestError,
@@ -256,6 +258,7 @@ BY_CODE: Mapping[str, type[ServiceError]] = {
     "idempotency_conflict": IdempotencyError,
     "idempotency_mismatch": IdempotencyError,
     "rate_limited": RateLimitedError,
+    "request_timeout": RetryLaterError,
     "overloaded": OverloadedError,
     "draining": UnavailableError,
     "not_ready": UnavailableError,
