@@ -16,4 +16,6 @@ def open_session(network: bytes, threads: int) -> ort.InferenceSession:
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
     options.log_severity_level = 3
+    # Threads that wait for the next run would take a core from whatever handles the result.
+    options.add_session_config_entry("session.force_spinning_stop", "1")
     return ort.InferenceSession(network, options, providers=["CPUExecutionProvider"])
