@@ -65,7 +65,8 @@ def drive(
     camera = avatar.camera if crop is None else face.camera.in_crop(crop)
     if reference is not None:
         start = reference.coefficients
-        expression = source.expression + driver.expression - start.expression
+        # The difference first: where the driver has not moved it is exactly nothing.
+        expression = source.expression + (driver.expression - start.expression)
         pose = np.concatenate(
             [composed(composed(driver.joint(j), -start.joint(j)), source.joint(j)) for j in JOINTS]
         )
