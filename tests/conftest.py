@@ -11,6 +11,11 @@ from pathlib import Path
 
 import pytest
 
+from cvthead import Avatar, Pipeline
+from cvthead.images import read_image
+
+PORTRAIT = Path(__file__).parents[1] / "examples" / "astronaut.png"
+
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
@@ -20,6 +25,30 @@ def shared() -> Path:
     if not path.is_dir():
         pytest.skip(f"no reference data at {path}; set CVTHEAD_SHARED")
     return path
+
+
+@pytest.fixture(scope="session")
+def pipeline() -> Pipeline:
+    """The packaged open preset."""
+    return Pipeline.load()
+
+
+@pytest.fixture(scope="session")
+def avatar(pipeline: Pipeline) -> Avatar:
+    """Of the sample portrait."""
+    return pipeline.encode(read_image(PORTRAIT))
+
+
+@pytest.fixture
+def one_thread(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Pictures as small as training tests use gain nothing from a second thread."""
+    import torch
+
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="session")

@@ -2,31 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from cvthead import Avatar, Pipeline
 from cvthead.head.model import Region
-from cvthead.images import read_image
 from cvthead.runtime.place import SEEN, SEEN_MIRRORED, place
 from cvthead.runtime.triangles import FAR, rasterise
 from cvthead.runtime.warp import dense_flow, warp
 
-PORTRAIT = Path(__file__).parents[1] / "examples" / "astronaut.png"
 SIZE = 256
 EMPTY = FAR - 0.1
-
-
-@pytest.fixture(scope="module")
-def pipeline() -> Pipeline:
-    return Pipeline.load()
-
-
-@pytest.fixture(scope="module")
-def avatar(pipeline: Pipeline) -> Avatar:
-    return pipeline.encode(read_image(PORTRAIT))
 
 
 def eye_box(points: np.ndarray, pipeline: Pipeline) -> tuple[slice, slice]:

@@ -36,16 +36,6 @@ MIN_PSNR = 40.0
 
 
 @pytest.fixture(scope="module")
-def pipeline() -> Pipeline:
-    return Pipeline.load()
-
-
-@pytest.fixture(scope="module")
-def avatar(pipeline: Pipeline) -> Avatar:
-    return pipeline.encode(read_image(PORTRAIT))
-
-
-@pytest.fixture(scope="module")
 def source(pipeline: Pipeline) -> Source:
     image = read_image(PORTRAIT)
     crop = cut_head(pipeline.tracker, image, pipeline.tracker.track(image))

@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +28,8 @@ from cvthead.training.config import TrainConfig, load_config
 from cvthead.training.dataset import PairDataset, flip_order, flip_points
 from cvthead.training.perceptual import perceptual_weights
 from cvthead.training.train import train
+
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 # Of a resumed run's losses; the sums' order in a thread pool is all that may differ.
 TOLERANCE = 1e-4
@@ -59,16 +60,6 @@ def _perceptual() -> None:
         perceptual_weights("alex")
     except AssetError as error:
         pytest.skip(f"no perceptual weights: {error}")
-
-
-@pytest.fixture(autouse=True)
-def _one_thread(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Pictures this small gain nothing from a second thread."""
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def small(folder: Path, run: Path, **changes: Any) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -21,6 +20,8 @@ from cvthead.training.identity import IdentityDistance, VGGFace2ResNet50
 from cvthead.training.perceptual import perceptual_weights
 from cvthead.training.train import train
 from cvthead.training.vgg import BLOCKS, VGGDistance, vgg_features
+
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def made_vgg(path: Path, name: str) -> Path:
@@ -111,15 +112,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("records")
     make_records(path)
     return path
-
-
-@pytest.fixture(autouse=True)
-def _one_thread(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def settings(folder: Path, run: Path, **changes: object) -> TrainConfig:

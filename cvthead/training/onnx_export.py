@@ -194,8 +194,11 @@ def export_paint(model: CVTHead, largest: Tensor, feature_range: float, path: Pa
     batch = torch.export.Dim("batch", min=1, max=MAX_BATCH)
     _export(graph, inputs, path, {name: {0: batch} for name in inputs})
     with torch.inference_mode():
-        _compare(graph(*inputs.values()), _reference(model.eval(), largest, **inputs))
-    _check(path, inputs, graph(*inputs.values()).detach(), PAINT_TOLERANCE)
+        found = graph(*inputs.values())
+        expected = _reference(model.eval(), largest, **inputs)
+    hint = "its folded first and last convolutions no longer fit the model"
+    _compare("the frame graph", found.numpy(), expected, PAINT_TOLERANCE, hint)
+    _check(path, inputs, found, PAINT_TOLERANCE)
 
 
 def _reference(model: CVTHead, largest: Tensor, splat: Tensor, portrait: Tensor) -> Tensor:
@@ -215,15 +218,6 @@ def _reference(model: CVTHead, largest: Tensor, splat: Tensor, portrait: Tensor)
     out = out.reshape(-1, 5, size, step, size, step).permute(0, 2, 4, 3, 5, 1) - 0.5 / 127.5
     rgba, gate = (x.reshape(-1, size, size, n) for x, n in ((out[..., :4], 16), (out[..., 4:], 4)))
     return torch.cat([rgba, gate], dim=-1)
-
-
-def _compare(found: Tensor, expected: Tensor) -> None:
-    difference = float((found - expected).abs().max())
-    if difference > PAINT_TOLERANCE:
-        raise AssetError(
-            f"the frame graph differs from the model by {difference:g}",
-            hint="its folded first and last convolutions no longer fit the model",
-        )
 
 
 def _export(
@@ -268,9 +262,13 @@ def _check(path: Path, inputs: Mapping[str, Tensor], expected: Tensor, tolerance
     session = ort.InferenceSession(str(path), providers=["CPUExecutionProvider"])
     feed = {name: value.numpy() for name, value in inputs.items()}
     found: NDArray[np.float32] = session.run(None, feed)[0]
+    hint = "look for an operator that the exporter translates differently"
+    _compare(path.name, found, expected, tolerance, hint)
+
+
+def _compare(name: str, found: NDArray[Any], expected: Tensor, tolerance: float, hint: str) -> None:
     difference = float(np.abs(found.astype(np.float32) - expected.float().numpy()).max())
     if difference > tolerance:
         raise AssetError(
-            f"{path.name} differs from torch by {difference:g}, allowed {tolerance:g}",
-            hint="look for an operator that the exporter translates differently",
+            f"{name} differs from torch by {difference:g}, allowed {tolerance:g}", hint=hint
         )

@@ -21,16 +21,6 @@ from service.engine import Engine, Output, RenderJob
 from service.metrics import Metrics
 
 
-@pytest.fixture(scope="module")
-def pipeline() -> Pipeline:
-    return Pipeline.load()
-
-
-@pytest.fixture(scope="module")
-def avatar(pipeline: Pipeline) -> Avatar:
-    return pipeline.encode(read_image(PORTRAIT))
-
-
 @asynccontextmanager
 async def engine_of(pipeline: Pipeline) -> AsyncIterator[tuple[Engine, Metrics]]:
     metrics = Metrics()
