@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from cvthead.camera import Camera
 from cvthead.coefficients import Array, Coefficients
 from cvthead.composite import Background, Composer
+from cvthead.controls import Controls, resolve
 from cvthead.frame import Frame
 from cvthead.head.model import HeadModel, Region
 from cvthead.images import ImageFormat, decode_image, encode_image
@@ -58,13 +59,20 @@ class Output:
     quality: int = 90
 
 
+Pose = tuple[Coefficients, Camera]
+
+
 @dataclass(frozen=True, eq=False)
 class RenderJob:
-    """One frame of an avatar: full coefficients, normalised camera."""
+    """One frame of an avatar.
+
+    Attributes:
+        wanted: full coefficients and normalised camera; or controls, which the worker resolves,
+            because that takes the event loop too long.
+    """
 
     avatar: AnyAvatar
-    coefficients: Coefficients
-    camera: Camera
+    wanted: Pose | Controls
     output: Output
 
 
@@ -207,6 +215,7 @@ class Engine:
 
         Raises:
             ModelChangedError, AvatarFileError: as ``Pipeline.pose``.
+            CoefficientsError: as ``cvthead.controls.resolve``.
         """
         result: Rendered = await self._rendering.submit(job)
         return result
@@ -238,7 +247,7 @@ class Engine:
             job: RenderJob = item.job
             try:
                 with self._stage("pose", timings):
-                    points = self.pipeline.pose(job.avatar, job.coefficients, job.camera)
+                    points = self.pipeline.pose(job.avatar, *self._pose(job))
             except Exception as error:  # one avatar's fault is not its neighbours'
                 item.future.set_exception(error)
             else:
@@ -258,6 +267,12 @@ class Engine:
             timings["encode"] = timings.pop("image")
             media_type = MEDIA_TYPES[item.job.output.format]
             item.future.set_result(Rendered(data, media_type, source, timings))
+
+    def _pose(self, job: RenderJob) -> Pose:
+        if not isinstance(job.wanted, Controls):
+            return job.wanted
+        avatar = job.avatar
+        return resolve(avatar.coefficients, avatar.camera, job.wanted, self.pipeline.arkit)
 
     @contextmanager
     def _stage(self, name: str, timings: dict[str, float] | None = None) -> Iterator[None]:

@@ -69,5 +69,5 @@ def writable(folder: Path) -> bool:
 async def metrics(request: Request, service: ServiceDep) -> Response:
     """Needs a key when keys are set, unless `metrics_public` is."""
     if not service.settings.metrics_public:
-        authenticated(request)
+        await authenticated(request)
     return Response(service.metrics.text(), media_type=CONTENT_TYPE_LATEST)

@@ -94,13 +94,13 @@ async def tenant(
     Raises:
         Problem: ``unauthorized``, ``rate_limited``.
     """
-    return authenticated(request)
+    return await authenticated(request)
 
 
 TenantDep = Annotated[Tenant, Depends(tenant)]
 
 
-def authenticated(connection: HTTPConnection, *, ticket: str | None = None) -> Tenant:
+async def authenticated(connection: HTTPConnection, *, ticket: str | None = None) -> Tenant:
     """The tenant of a request, or of a WebSocket handshake, which may bring a ticket instead.
 
     Raises:
@@ -109,7 +109,7 @@ def authenticated(connection: HTTPConnection, *, ticket: str | None = None) -> T
     service = connection.app.state.service
     address = f"address {connection.client.host}" if connection.client else "address"
     if not service.keys:
-        service.limiter.check(address)
+        await service.limiter.check(address)
         return Tenant("")
     scheme, _, key = connection.headers.get("authorization", "").partition(" ")
     found: Tenant | None = None
@@ -118,9 +118,9 @@ def authenticated(connection: HTTPConnection, *, ticket: str | None = None) -> T
     elif ticket:
         found = service.tickets.redeem(ticket)
     if found is None:
-        service.limiter.check(address)  # guessing is slowed down too
+        await service.limiter.check(address)  # guessing is slowed down too
         raise Problem("unauthorized", headers={"WWW-Authenticate": "Bearer"})
-    service.limiter.check(f"key {found.name}")
+    await service.limiter.check(f"key {found.name}")
     return found
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import time
 
 from limits import RateLimitItemPerMinute
-from limits.storage import MemoryStorage
-from limits.strategies import SlidingWindowCounterRateLimiter
+from limits.aio.storage import MemoryStorage
+from limits.aio.strategies import SlidingWindowCounterRateLimiter
 
 from service.problems import Problem, retry_after
 
@@ -22,15 +22,15 @@ class RateLimiter:
         self._item = RateLimitItemPerMinute(per_minute) if per_minute else None
         self._limiter = SlidingWindowCounterRateLimiter(MemoryStorage())
 
-    def check(self, client: str) -> None:
+    async def check(self, client: str) -> None:
         """Count a request of ``client``.
 
         Raises:
             Problem: ``rate_limited``, with Retry-After.
         """
-        if self._item is None or self._limiter.hit(self._item, client):
+        if self._item is None or await self._limiter.hit(self._item, client):
             return
-        reset = self._limiter.get_window_stats(self._item, client).reset_time
+        reset = (await self._limiter.get_window_stats(self._item, client)).reset_time
         raise Problem(
             "rate_limited",
             f"more than {self._item.amount} requests in a minute",

@@ -1,4 +1,4 @@
-"""From a stream's frames to the coefficients and the camera of the avatar."""
+"""From a stream's frames to what the avatar is asked to do."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from cvthead_client.hello import Hello
 from cvthead_client.wire import CoefficientFrame, Kind, Message, unpack_coefficients
 
 from cvthead.camera import Camera, Crop
-from cvthead.coefficients import JOINTS, Coefficients
-from cvthead.controls import Controls, resolve
+from cvthead.coefficients import JOINTS
+from cvthead.controls import Controls
 from cvthead.crop import head_crop
 from cvthead.driving import drive
 from cvthead.preset import AnyAvatar
 from cvthead.tracking.one_euro import FaceFilter
 from cvthead.tracking.tracker import TrackedFace
-from service.engine import Engine
+from service.engine import Engine, Pose
 
 # The face networks look at 256 pixels; more only takes time.
 LONGEST_SIDE = 960
@@ -37,7 +37,7 @@ class Motion:
         self._reference: TrackedFace | None = None
         self._crop: Crop | None = None
 
-    async def of(self, message: Message) -> tuple[Coefficients, Camera]:
+    async def of(self, message: Message) -> Pose | Controls:
         """What a COEFFICIENTS, DRIVING or REFERENCE message asks for.
 
         Raises:
@@ -46,9 +46,7 @@ class Motion:
             Problem: ``overloaded``, ``draining``.
         """
         if message.kind is Kind.COEFFICIENTS:
-            controls = controls_of(unpack_coefficients(message.payload), self._hello)
-            avatar, arkit = self._avatar, self._engine.pipeline.arkit
-            return resolve(avatar.coefficients, avatar.camera, controls, arkit)
+            return controls_of(unpack_coefficients(message.payload), self._hello)
         face = await self._face(message)
         head = self._engine.pipeline.head
         # Without a reference frame the first one serves.

@@ -7,12 +7,11 @@ from typing import Any
 from starlette.requests import Request
 from starlette.responses import Response
 
-from cvthead.camera import Camera
-from cvthead.coefficients import Coefficients
 from cvthead.composite import background
+from cvthead.controls import Controls
 from cvthead.images import ImageFormat
 from cvthead.preset import AnyAvatar
-from service.engine import Output, Rendered, RenderJob
+from service.engine import Output, Pose, Rendered, RenderJob
 from service.middleware import server_timing
 from service.negotiation import IMAGE_TYPES
 from service.problems import responses
@@ -72,7 +71,7 @@ async def send_frame(
     request: Request,
     service: Service,
     avatar: AnyAvatar,
-    pose: tuple[Coefficients, Camera],
+    wanted: Pose | Controls,
     output: Output,
     timings: dict[str, float] | None = None,
 ) -> Response:
@@ -81,7 +80,7 @@ async def send_frame(
     Args:
         timings: milliseconds of earlier stages, for Server-Timing.
     """
-    job = RenderJob(avatar, *pose, output)
+    job = RenderJob(avatar, wanted, output)
     rendered = await unless_gone(request, service.engine.render(job))
     rendered = await signed(service.signer, rendered)
     return Response(

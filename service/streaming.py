@@ -124,8 +124,8 @@ class Session:
                 await asyncio.sleep(OVERLOAD_PAUSE)
 
     async def _render(self, message: Message) -> None:
-        coefficients, camera = await self._motion.of(message)
-        job = RenderJob(self.avatar, coefficients, camera, self._output)
+        wanted = await self._motion.of(message)
+        job = RenderJob(self.avatar, wanted, self._output)
         rendered = await self.service.engine.render(job)
         codec = CODECS[self.hello.output.codec]
         reply = Message(Kind.RENDERED, codec, message.sequence, message.capture_time, rendered.data)

@@ -10,15 +10,13 @@ from fastapi import APIRouter, Request, Response
 from starlette.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
-from cvthead.camera import Camera
-from cvthead.coefficients import Coefficients
 from cvthead.controls import resolve
 from cvthead.head.arkit import ArkitMap
 from cvthead.preset import AnyAvatar
 from cvthead.provenance import SourceType
 from service.bodies import json_body, read_json
 from service.containers import MULTIPART_TYPE, PARTS, VIDEO_TYPE, Frames, Parts, video
-from service.engine import Output, RenderJob
+from service.engine import Output, Pose, RenderJob
 from service.frames import rendered_in_order
 from service.keys import TenantDep
 from service.negotiation import accept, best_type
@@ -77,7 +75,7 @@ async def batch(
     avatar = await load(service, tenant, avatar_id)
     output = _output(wanted, kind)
     poses = await asyncio.to_thread(_poses, wanted, avatar, service.pipeline.arkit)
-    jobs = [RenderJob(avatar, *pose, output) for pose in poses]
+    jobs = [RenderJob(avatar, pose, output) for pose in poses]
     frames = rendered_in_order(service.engine, jobs)
     source = SourceType.COMPOSITE if output.background == "source" else SourceType.GENERATED
     headers = {
@@ -104,9 +102,7 @@ def _output(wanted: BatchRequest, kind: str) -> Output:
     return Output(opaque.size, opaque.background, "raw", opaque.quality)
 
 
-def _poses(
-    wanted: BatchRequest, avatar: AnyAvatar, arkit: ArkitMap
-) -> list[tuple[Coefficients, Camera]]:
+def _poses(wanted: BatchRequest, avatar: AnyAvatar, arkit: ArkitMap) -> list[Pose]:
     """All at once, so that a mistake in the last frame is found before the first is sent."""
     controls = [checked_controls(f, avatar, f"frames/{i}") for i, f in enumerate(wanted.frames)]
     return [resolve(avatar.coefficients, avatar.camera, c, arkit) for c in controls]

@@ -9,7 +9,6 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request, Response
 
 from cvthead.camera import Crop
-from cvthead.controls import resolve
 from cvthead.crop import head_crop
 from cvthead.driving import drive
 from cvthead.tracking.tracker import TrackedFace
@@ -52,9 +51,7 @@ async def render(
     wanted = await read_json(request, RenderRequest, MAX_JSON)
     output = output_of(wanted.output, kind, where="body", pointer="/output")
     avatar = await load(service, tenant, avatar_id)
-    controls = wanted.controls(avatar)
-    pose = resolve(avatar.coefficients, avatar.camera, controls, service.pipeline.arkit)
-    return await send_frame(request, service, avatar, pose, output)
+    return await send_frame(request, service, avatar, wanted.controls(avatar), output)
 
 
 @router.post(

@@ -32,7 +32,7 @@ async def stream(socket: WebSocket, avatar_id: str, service: ServiceDep, ticket:
     # Accepted before it is refused: browsers tell a page the close code, but not the HTTP status.
     await socket.accept()
     try:
-        tenant = _admit(service, socket, ticket)
+        tenant = await _admit(service, socket, ticket)
         with _counted(service):
             avatar = await asyncio.to_thread(_avatar, service, avatar_id, tenant)
             hello = await _hello(socket)
@@ -62,7 +62,7 @@ def _reason(error: Exception) -> tuple[str, str, str]:
     return problem.code, str(problem.detail), problem.hint
 
 
-def _admit(service: Service, socket: WebSocket, ticket: str) -> Tenant:
+async def _admit(service: Service, socket: WebSocket, ticket: str) -> Tenant:
     """Who opens the stream.
 
     Raises:
@@ -71,7 +71,7 @@ def _admit(service: Service, socket: WebSocket, ticket: str) -> Tenant:
     # A page of another site could open a stream in the name of a visitor on this network.
     if not origin_allowed(socket, service.settings.websocket_origins):
         raise Problem("forbidden", "the calling page's origin is not allowed")
-    return authenticated(socket, ticket=ticket)
+    return await authenticated(socket, ticket=ticket)
 
 
 @contextmanager

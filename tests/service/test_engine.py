@@ -33,7 +33,7 @@ async def engine_of(pipeline: Pipeline) -> AsyncIterator[tuple[Engine, Metrics]]
 
 
 def job_of(avatar: Avatar, output: Output | None = None) -> RenderJob:
-    return RenderJob(avatar, avatar.coefficients, avatar.camera, output or Output())
+    return RenderJob(avatar, (avatar.coefficients, avatar.camera), output or Output())
 
 
 def run(pipeline: Pipeline, work: Callable[[Engine, Metrics], Awaitable[None]]) -> None:

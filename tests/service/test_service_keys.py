@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import hmac
 
 import pytest
@@ -88,18 +89,25 @@ def test_unused_tickets_are_bounded_and_forgotten() -> None:
 
 
 def test_each_client_has_its_own_rate() -> None:
+    asyncio.run(_three_are_allowed())
+
+
+async def _three_are_allowed() -> None:
     limiter = RateLimiter(3)
     for _ in range(3):
-        limiter.check("key alice")
+        await limiter.check("key alice")
     with pytest.raises(Problem) as caught:
-        limiter.check("key alice")
+        await limiter.check("key alice")
     assert caught.value.status_code == 429
     assert caught.value.headers is not None
     assert 1 <= int(caught.value.headers["Retry-After"]) <= 61
-    limiter.check("key bob")
+    await limiter.check("key bob")
 
 
 def test_zero_is_no_limit() -> None:
-    limiter = RateLimiter(0)
-    for _ in range(1000):
-        limiter.check("key alice")
+    async def thousand() -> None:
+        limiter = RateLimiter(0)
+        for _ in range(1000):
+            await limiter.check("key alice")
+
+    asyncio.run(thousand())
