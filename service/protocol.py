@@ -1,4 +1,5 @@
-"""HTTP/1.1 on a socket: uvicorn's protocol with limits on slow and on endless requests."""
+"""HTTP/1.1 on a socket: uvicorn's protocol with limits on slow and on endless requests, and on
+answers that nobody reads."""
 
 from __future__ import annotations
 
@@ -11,6 +12,7 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from uvicorn.server import ServerState
 
 from service.problems import Problem
+from service.settings import Settings
 
 MAX_HEAD_BYTES = 2**16
 # The application itself answers a slow body (service/middleware.py); it gets this long for it.
@@ -18,7 +20,8 @@ GRACE_SECONDS = 5.0
 
 
 class LimitedProtocol(HttpToolsProtocol):
-    """Gives a request's head, and then its body, ``receive_seconds`` to arrive.
+    """Gives a request's head, and then its body, ``receive_seconds`` to arrive; and the client
+    ``send_seconds`` to make room when the socket takes no more of the answer.
 
     Without a limit, clients that send a byte now and then hold connections for ever. What cannot
     be read is answered here, because no application is called for it; uvicorn alone would answer
@@ -33,8 +36,11 @@ class LimitedProtocol(HttpToolsProtocol):
         _loop: asyncio.AbstractEventLoop | None = None,
     ) -> None:
         super().__init__(config, server_state, app_state, _loop)
-        self._seconds: float = config.app.state.service.settings.receive_seconds  # type: ignore[union-attr]
+        settings: Settings = config.app.state.service.settings  # type: ignore[union-attr]
+        self._seconds = settings.receive_seconds
+        self._send_seconds = settings.send_seconds
         self._timer: asyncio.TimerHandle | None = None
+        self._unread: asyncio.TimerHandle | None = None
         self._head_bytes = 0
         self._in_head = False
 
@@ -44,6 +50,7 @@ class LimitedProtocol(HttpToolsProtocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._limit(None)
+        self._taken()
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
@@ -72,7 +79,20 @@ class LimitedProtocol(HttpToolsProtocol):
 
     def handle_websocket_upgrade(self) -> None:
         self._limit(None)
+        self._taken()
         super().handle_websocket_upgrade()
+
+    def pause_writing(self) -> None:
+        super().pause_writing()
+        self._unread = self.loop.call_later(self._send_seconds, self.transport.abort)
+
+    def resume_writing(self) -> None:
+        self._taken()
+        super().resume_writing()
+
+    def _taken(self) -> None:
+        if self._unread is not None:
+            self._unread.cancel()
 
     def send_400_response(self, msg: str) -> None:
         self._refuse(Problem("malformed_request"))

@@ -104,6 +104,13 @@ class Settings(BaseSettings):
         description="Longest time for a request's headers, and again for its body, to arrive; then "
         "408 `request_timeout`.",
     )
+    send_seconds: float = Field(
+        60,
+        gt=0,
+        le=3600,
+        description="Longest time in which a client takes nothing of its answer; then the "
+        "connection is closed. Streams have their acknowledgement window instead.",
+    )
     encode_queue: int = Field(
         8, ge=1, description="Uploads that may wait; one more gets 503 `overloaded`."
     )

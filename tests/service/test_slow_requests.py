@@ -1,4 +1,5 @@
-"""Requests that come slowly, endlessly or in no HTTP, over a real socket."""
+"""Requests that come slowly, endlessly or in no HTTP, and answers that nobody reads, over a real
+socket."""
 
 from __future__ import annotations
 
@@ -6,8 +7,10 @@ import json
 import socket
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any
 
+import httpx
 import pytest
 from raw_stream import coefficients, raw_stream
 from server_process import PORTRAIT, Server, start_server
@@ -22,7 +25,8 @@ BODY = HEAD + b"Content-Type: image/png\r\nContent-Length: 100000\r\n\r\n"
 
 @pytest.fixture(scope="module")
 def impatient(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    with start_server(tmp_path_factory.mktemp("slow"), receive_seconds=SECONDS) as running:
+    limits = {"receive_seconds": SECONDS, "send_seconds": SECONDS}
+    with start_server(tmp_path_factory.mktemp("slow"), **limits) as running:
         yield running
 
 
@@ -114,3 +118,35 @@ def test_what_is_no_http_gets_a_problem(impatient: Server, sent: bytes) -> None:
     with opened(impatient) as link:
         link.sendall(sent)
         problem(link.recv(65536), "malformed_request")
+
+
+@pytest.mark.parametrize("reads", [False, True])
+def test_an_answer_that_nobody_reads_is_given_up(impatient: Server, reads: bool) -> None:
+    """And one that is read slowly is sent to its end."""
+    with impatient.client() as client:
+        uploaded = client.post("/v1/avatars", content=PORTRAIT.read_bytes())
+        path = uploaded.json()["links"]["batch"]
+        frames = [{"pose": {"global": [0, turn / 100, 0]}} for turn in range(100)]
+        body = json.dumps({"frames": frames, "output": {"size": 512}}).encode()
+        head = f"POST {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n"
+        kind = f"Content-Type: application/json\r\nContent-Length: {len(body)}\r\n\r\n"
+        with opened(impatient) as link:
+            link.sendall(f"{head}{kind}".encode() + body)
+            if not reads:
+                answering(client, 2)
+                answering(client, 1)
+            answer, pauses = b"", 10
+            with suppress(ConnectionError):
+                while data := link.recv(2**20):
+                    answer += data
+                    time.sleep(SECONDS / 5 if pauses else 0)
+                    pauses = max(0, pauses - 1)
+    assert answer.endswith(b"0\r\n\r\n") is reads
+
+
+def answering(client: httpx.Client, requests: int) -> None:
+    """Wait until as many requests are being answered, the one that asks among them."""
+    closes = time.monotonic() + 60
+    while f"cvthead_requests_in_flight {requests}.0" not in client.get("/metrics").text:
+        assert time.monotonic() < closes, f"not {requests} in flight"
+        time.sleep(PAUSE)
