@@ -11,6 +11,8 @@ EMPTY = -1
 EMPTY_DEPTH = -2.0
 BLOCK = 4  # pixels; wide enough that the points of the front surface leave no block empty
 FRONT = 0.15  # thickness of the front surface in normalised depth, about 25 mm
+NOTHING = np.iinfo(np.int64).max
+NUMBER = 0xFFFFFFFF
 
 
 def splat(points: Array, size: int) -> NDArray[np.int64]:
@@ -32,13 +34,22 @@ def splat(points: Array, size: int) -> NDArray[np.int64]:
     nearest = np.full((size // BLOCK) ** 2, np.inf, np.float32)
     np.minimum.at(nearest, block, depth)
     front = np.nonzero(depth <= nearest[block] + np.float32(FRONT))[0]
-    # Farthest first, so that the last writer of a pixel is the nearest point.
-    front = front[np.argsort(-depth[front], kind="stable")]
-    owner = np.full(size * size, EMPTY, np.int64)
-    owner[row[front] * size + column[front]] = inside[front]
+    # Depth and number in one integer, whose minimum is the nearest point of the highest number: a
+    # fraction of the time of sorting them.
+    key = _ordered(depth[front]) << 32
+    key -= inside[front]
+    first = np.full(size * size, NOTHING, np.int64)
+    np.minimum.at(first, row[front] * size + column[front], key)
+    owner = np.where(first == NOTHING, EMPTY, -first & NUMBER)
     return owner.reshape(size, size)
 
 
 def _pixel(coordinate: Array, size: int) -> NDArray[np.int64]:
     place = (coordinate * np.float32(0.5) + np.float32(0.5)) * np.float32(size)
     return np.asarray(np.floor(place), np.int64)
+
+
+def _ordered(values: Array) -> NDArray[np.int64]:
+    """Integers in the order of the float32 values."""
+    bits = values.view(np.int32)
+    return np.where(bits < 0, bits ^ np.int32(0x7FFFFFFF), bits).astype(np.int64)
