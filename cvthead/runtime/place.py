@@ -109,21 +109,25 @@ def _refine(flow: Array, layout: PointLayout, points: Array, places: Array, dept
     """Replace the flow (size, size, 2) where the face's triangles are in front."""
     size, own = flow.shape[0], layout.detail_vertices
     corners, faces = points[own], layout.detail_faces
-    away = corners[:, 2] >= FAR
+    away = _votes(corners[:, 2] >= FAR, faces) > 0
     if away.any():
-        faces = faces[~away[faces].any(axis=1)]
+        faces = faces[~away]
     if not len(faces):
         return
-    # Every vertex twice: carried from its own place, and from the one across the face.
-    both = np.concatenate([places[own], places[layout.mirror[own]]])
-    both[: len(own), 2] = both[: len(own), 2] == SEEN
-    both[len(own) :, 2] = places[own, 2] == SEEN_MIRRORED
-    clear = both[:, 2][np.stack([faces, faces + len(own)])].sum(axis=2) > 1.5
-    faces = np.where((clear[1] & ~clear[0])[:, None], faces + len(own), faces)
-    corners = np.concatenate([corners, corners])
-    values = both
-    np.clip(both[:, :2] - corners[:, :2], -LARGEST_FLOW, LARGEST_FLOW, out=values[:, :2])
-    values[:, :2] = values[:, :2] * np.float32(0.5 / LARGEST_FLOW) + np.float32(0.5)
+    sources = places[own]
+    seen = sources[:, 2] == SEEN
+    across = sources[:, 2] == SEEN_MIRRORED
+    mirrored = (_votes(across, faces) > 1) & (_votes(seen, faces) <= 1)
+    if mirrored.any():
+        # Every vertex twice: carried from its own place, and from the one across the face.
+        faces = np.where(mirrored[:, None], faces + len(own), faces)
+        corners = np.concatenate([corners, corners])
+        sources = np.concatenate([sources, places[layout.mirror[own]]])
+        seen = np.concatenate([seen, across])
+    carry = np.clip(sources[:, :2] - corners[:, :2], -LARGEST_FLOW, LARGEST_FLOW)
+    values = np.empty_like(corners)
+    values[:, :2] = carry * np.float32(0.5 / LARGEST_FLOW) + np.float32(0.5)
+    values[:, 2] = seen
 
     image, front = rasterise(corners, faces, values, size)
     limit = np.where(depth == EMPTY_DEPTH, np.float32(FAR), depth + np.float32(BEHIND))
@@ -134,6 +138,13 @@ def _refine(flow: Array, layout: PointLayout, points: Array, places: Array, dept
     carried = np.empty_like(flow)
     cv2.mixChannels([image], [carried], [0, 0, 1, 1])
     cv2.copyTo(carried, found.view(np.uint8), flow)
+
+
+def _votes(chosen: NDArray[np.bool_], faces: NDArray[np.int32]) -> NDArray[np.uint8]:
+    """How many corners of each face (F, 3) are among the chosen vertices, 0 to 3."""
+    first, second, third = faces.T
+    counted = chosen.view(np.uint8)
+    return np.asarray(counted[first] + counted[second] + counted[third])
 
 
 def reach_of(known: NDArray[np.bool_], warped: Codes) -> Codes:
