@@ -40,9 +40,8 @@ def fill(values: Codes, known: NDArray[np.bool_]) -> tuple[Codes, Codes]:
         out = np.where(some, mean, coarse.reshape(mean.shape))
     small = np.rint(out).astype(np.uint8)
     large = cv2.resize(small, (size, size), interpolation=cv2.INTER_LINEAR)
-    filled = large.reshape(values.shape).astype(np.uint8, copy=False)
-    filled[known] = values[known]
-    return filled, coverage
+    filled = cv2.copyTo(values, known.view(np.uint8), large.reshape(values.shape))
+    return np.asarray(filled, np.uint8), coverage
 
 
 def _quarters(a: NDArray[np.uint16]) -> NDArray[np.uint16]:

@@ -10,7 +10,7 @@ from cvthead.runtime.subpixels import shuffled
 
 Codes = NDArray[np.uint8]
 
-PAINTED = 16  # channels: RGB and mask of each of a block's pixels, then the gates
+GATES = 4  # where they begin among the 32-bit numbers
 # The network gives mask and gate as logits in -LOGIT_RANGE..LOGIT_RANGE.
 LOGIT_RANGE = 8.0
 SIGMOID = np.reciprocal(1 + np.exp(LOGIT_RANGE * (1 - np.arange(256) / 127.5)))
@@ -22,16 +22,19 @@ def mix(codes: Codes, warped: Codes, reach: Codes) -> Codes:
     """One frame.
 
     Args:
-        codes: (s, s, 20) of the network.
+        codes: (s, s, 20) of the network: RGB and mask of each of a block's pixels, then the
+            pixels' gates.
         warped: (2s, 2s, 4) the portrait carried to the pose.
         reach: (2s, 2s) highest alpha.
 
     Returns:
         (2s, 2s, 4) RGBA.
     """
-    blocks = np.ascontiguousarray(codes[..., :PAINTED]).view(np.uint32)
-    painted = _even(shuffled(blocks).view(np.uint8).reshape(warped.shape))
-    gate = cv2.LUT(_even(shuffled(codes[..., PAINTED:])), GATE)
+    fours = codes.view(np.uint32)  # a block's four pixels, then its four gates
+    pixels = shuffled(np.ascontiguousarray(fours[..., :GATES]))
+    painted = _even(pixels.view(np.uint8).reshape(warped.shape))
+    gates = shuffled(np.ascontiguousarray(fours[..., GATES:]).view(np.uint8))
+    gate = cv2.LUT(_even(gates), GATE)
     out = cv2.blendLinear(warped, painted, gate, 1 - gate)
     alpha = cv2.min(cv2.LUT(cv2.extractChannel(painted, 3), ALPHA), reach)
     cv2.insertChannel(alpha, out, 3)
