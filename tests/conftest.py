@@ -54,7 +54,10 @@ def one_thread(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 @pytest.fixture(scope="session")
 def official_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A made-up official release in ``whole``, its import in ``model``, what the command said in
-    ``said``. Made once: it takes more than a gigabyte."""
+    ``said``. Made once: it takes a minute and more than a gigabyte.
+
+    It replaces an earlier import (kept in ``earlier``), whose folder the command knows by
+    ``link``; without --replace that was ``refused``."""
     import made_official  # needs PyTorch, which few tests do
 
     from cvthead.cli.main import main
@@ -62,9 +65,15 @@ def official_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     base = tmp_path_factory.mktemp("official")
     (base / "whole").mkdir()
     made_official.write_whole(base / "whole", made_official.state(), made_official.tables())
-    said = io.StringIO()
-    with contextlib.redirect_stdout(said):
-        assert main(["import-official", str(base / "whole"), "-o", str(base / "model")]) == 0
+    made_official.earlier_import(base / "model")
+    shutil.copytree(base / "model", base / "earlier")
+    (base / "link").symlink_to(base / "model")
+    said, refused = io.StringIO(), io.StringIO()
+    command = ["import-official", str(base / "whole"), "-o", str(base / "link")]
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(refused):
+        assert main(command) == 2
+        assert main([*command, "--replace"]) == 0
     (base / "said").write_text(said.getvalue())
+    (base / "refused").write_text(refused.getvalue())
     yield base
     shutil.rmtree(base)

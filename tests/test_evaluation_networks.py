@@ -100,8 +100,9 @@ def test_paper_table_names_what_is_absent(tmp_path: Path) -> None:
     speeds = {"A": np.array([2.5, 20.0])}
     none = UserNetworks.load()
     bare = paper_table(none, pictures(2, 3), made, {"A": []}, speeds)
-    assert bare.rows["A"] == (None, None, None, 2.5, 20.0)
-    assert "| A | absent | absent | absent | 2.5 | 20.0 |" in bare.markdown()
+    assert bare.rows["A"] == (None, None, None, 2.5)
+    assert "| A | absent | absent | absent | 2.5 |" in bare.markdown()
+    assert paper_table(none, pictures(2, 3), made, {"A": []}, {}).rows["A"][3] is None
 
     brought = UserNetworks.load(
         fid=features(tmp_path / "fid.onnx", 2), iqa=features(tmp_path / "iqa.onnx", 1)

@@ -106,7 +106,8 @@ def test_the_papers_figures_stand_below_ours() -> None:
 
 def report() -> Report:
     table = score_table("self", "Both pictures on white:", [reenactment("v1", 17.25)])
-    return Report(["One clip."], {"Self": [table], "Empty": []}, {"clips": 90})
+    sections = {"Self": [table], "Empty": []}
+    return Report(["One clip."], sections, {"Empty": "there is nothing"}, {"clips": 90})
 
 
 def test_report_is_plain_json_without_nan() -> None:
@@ -114,12 +115,14 @@ def test_report_is_plain_json_without_nan() -> None:
     assert loaded["tables"]["self"]["rows"]["A<b>"]["PSNR ↑"] == 17.25
     assert loaded["tables"]["self"]["clips"]["A<b>"]["v1"]["lpips"] is None
     assert loaded["seconds"] == {"clips": 90}
+    assert loaded["absent"] == {"Empty": "there is nothing"}
 
 
 def test_report_tables_become_html_with_escaped_names() -> None:
     text = report().markdown()
     assert "## Self\n\nBoth pictures on white:\n\n| method |" in text
-    assert "Empty" not in text
+    assert "## Empty" not in text
+    assert "\n\nEmpty: absent, there is nothing.\n\n" in text
     html = tables(text)
     assert "<td>A&lt;b&gt;</td><td>0.0100</td><td>17.25</td>" in html
     assert "<h2>Self</h2>" in html

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -56,7 +57,8 @@ def test_evaluate_writes_tables_and_pictures(
     output = tmp_path / "out"
     assert main(["evaluate", "--data", str(data), "-o", str(output), *COUNTS]) == 0
 
-    report = json.loads((output / "report.json").read_text("utf-8"))["tables"]
+    whole = json.loads((output / "report.json").read_text("utf-8"))
+    report = whole["tables"]
     markdown = (output / "report.md").read_text("utf-8")
     assert markdown in capsys.readouterr().out
     assert "2 clips, 2 driving frames" in markdown
@@ -66,6 +68,8 @@ def test_evaluate_writes_tables_and_pictures(
     # The driver is the source but for a small tilt.
     assert score["CVTHead"]["PSNR ↑"] > 18
     assert score["coloured mesh, bald"]["PSNR ↑"] < score["coloured mesh"]["PSNR ↑"]
+    assert list(whole["absent"]) == ["Big poses"]
+    assert "Big poses: absent, no clip has two frames" in markdown
     assert "big poses" not in report
     assert report["self-reenactment, paper"]["rows"]["CVTHead"]["LPIPS ↓"] is None
 
@@ -74,7 +78,12 @@ def test_evaluate_writes_tables_and_pictures(
     assert cross["CVTHead"]["pose error, degrees ↓"] < 8
     assert report["turned"]["rows"]["CVTHead"]["lost ↓"] <= 4
     assert report["two sources"]["rows"]["copy source"]["PSNR ↑"] > 15
-    assert report["cross-identity, paper"]["rows"]["CVTHead"]["FPS ↑"] > 0
+    fps = report["speed"]["rows"]
+    assert 0 < fps["CVTHead"]["FPS ↑"] < fps["CVTHead"]["FPS, cached ↑"]
+    assert fps["CVTHead, paper"] == {"FPS ↑": 24.3, "FPS, cached ↑": None}
+    table = report["cross-identity, paper"]["rows"]
+    assert table["CVTHead"]["FPS ↑"] == fps["CVTHead"]["FPS ↑"]
+    assert table["CVTHead, paper, VoxCeleb1"]["FID ↓"] == 25.78
     assert set(report["groups, CVTHead"]["rows"]) == {"female/white", "all"}
     assert report["steadiness"]["rows"]["CVTHead"]["flicker on still coefficients"] > 0
 
@@ -89,13 +98,41 @@ def test_evaluate_writes_tables_and_pictures(
 def test_models_are_compared_in_one_table(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    models = ["--model", f"A={packaged('open')}", "--without-deformation"]
+    bald = tmp_path / "bald"
+    shutil.copytree(packaged("open"), bald)
+    record = json.loads((bald / "model.json").read_text("utf-8"))
+    record["training"]["deformation"] = "false"
+    (bald / "model.json").write_text(json.dumps(record), encoding="utf-8")
+    models = ["--model", f"A={packaged('open')}", "--model", f"B={bald}", "--without-deformation"]
     command = ["evaluate", "--data", str(data), "-o", str(tmp_path), "--only", "self", *models]
     assert main([*command, "--every", "2", *COUNTS]) == 0
-    rows = json.loads((tmp_path / "report.json").read_text("utf-8"))["tables"]
-    assert list(rows["self-reenactment"]["rows"])[:2] == ["A", "A, no deformation"]
-    assert list(rows["unseen"]["rows"])[:2] == ["A", "A, no deformation"]
+    tables = json.loads((tmp_path / "report.json").read_text("utf-8"))["tables"]
+    names = ["A", "B", "A, no deformation"]
+    assert list(tables["unseen"]["rows"])[:3] == names
+    rows = tables["self-reenactment"]["rows"]
+    assert list(rows)[:3] == names
+    assert rows["B"] == rows["A, no deformation"] != rows["A"]
     assert "| A, no deformation |" in capsys.readouterr().out
+
+
+def test_the_official_preset_is_evaluated(
+    data: Path, tmp_path: Path, official_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With one clip and made-up weights; what needs two clips is named as absent."""
+    monkeypatch.setenv("CVTHEAD_OFFICIAL", str(official_folder / "model"))
+    parts = [word for part in ("self", "cross", "speed") for word in ("--only", part)]
+    command = ["evaluate", "--data", str(data), "-o", str(tmp_path), "--preset", "official"]
+    assert main([*command, *parts, "--every", "2", *COUNTS]) == 0
+    report = json.loads((tmp_path / "report.json").read_text("utf-8"))
+    assert report["absent"] == {"Cross-identity": "it takes two clips with a trackable face"}
+    ours = report["tables"]["self-reenactment, paper"]["rows"]["CVTHead, official"]
+    assert ours["PSNR ↑"] > 0
+    assert report["tables"]["speed"]["rows"]["CVTHead, official"]["FPS, cached ↑"] > 0
+    assert set(report["tables"]["turned"]["rows"]) == {
+        *("CVTHead, official", "copy source", "coloured mesh")
+    }
+    page = (tmp_path / "index.html").read_text("utf-8")
+    assert all(f"<h2>{heading}</h2>" in page for heading in ("Self-reenactment", "Sweep"))
 
 
 @pytest.mark.parametrize(

@@ -14,22 +14,18 @@ import pytest
 import torch
 
 from cvthead import Avatar, Pipeline
-from cvthead.deformation import MAX_SHELL_POINTS
 from cvthead.errors import AssetError
-from cvthead.head.hierarchy import MeshHierarchy
 from cvthead.images import read_image
 from cvthead.model import splat as torch_splat
-from cvthead.model.config import OPEN
-from cvthead.model.cvthead import CVTHead
 from cvthead.model.fill import fill as torch_fill
-from cvthead.points import FAR_AWAY
 from cvthead.runtime.fill import FILL_LEVELS, ZERO, fill
-from cvthead.runtime.model_folder import PAINT, RECORD, WEIGHTS, ModelFolder, packaged
+from cvthead.runtime.model_folder import PAINT, RECORD, ModelFolder, packaged
 from cvthead.runtime.networks import Networks
 from cvthead.runtime.splat import EMPTY_DEPTH, splat
 from cvthead.runtime.subpixels import shuffled, unshuffled
-from cvthead.source import Source, as_network_input, cut_head, read_source
-from cvthead.weights import load_into
+from cvthead.source import Source, cut_head, read_source
+from tools import engine_page
+from tools.engine_page import FloatNetwork, psnr
 
 PORTRAIT = Path(__file__).parents[1] / "examples" / "astronaut.png"
 MIN_PSNR = 40.0
@@ -43,10 +39,8 @@ def source(pipeline: Pipeline) -> Source:
 
 
 @pytest.fixture(scope="module")
-def model(pipeline: Pipeline) -> CVTHead:
-    model = CVTHead(OPEN, MeshHierarchy.load(), pipeline.layout)
-    assert load_into(model, packaged("open") / WEIGHTS) == pipeline.fingerprint
-    return model.eval().requires_grad_(False)
+def exact(pipeline: Pipeline) -> FloatNetwork:
+    return FloatNetwork.load(pipeline)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -90,39 +84,28 @@ def test_subpixels_are_put_back() -> None:
 
 
 def test_frame_is_the_one_of_the_float_network(
-    pipeline: Pipeline, avatar: Avatar, model: CVTHead, source: Source
+    pipeline: Pipeline, avatar: Avatar, exact: FloatNetwork, source: Source
 ) -> None:
     for turn in (0.0, 0.4):
         posed = avatar.coefficients.with_joints({"global": (0.1, turn, 0), "jaw": (0.2, 0, 0)})
         points = pipeline.pose(avatar, posed, avatar.camera)
-        every = np.tile(FAR_AWAY, (pipeline.layout.total, 1))
-        every[: len(points)] = points
-        frame = pipeline.paint(avatar, points)
-        warped = as_network_input(pipeline.place(avatar, points).warped)
-        rgb, logits = model.paint(
-            torch.from_numpy(every)[None],
-            model.describe(*inputs(source)),
-            torch.from_numpy(source.places(pipeline.layout)[None, :, 2]),
-            torch.from_numpy(warped)[None],
-        )
-        alpha = logits[0, 0].sigmoid().numpy()
-        expected = (rgb[0].permute(1, 2, 0).numpy() + 1) * 127.5 * alpha[..., None]
-        shown = frame.rgb * (frame.alpha[..., None] / 255.0)
-        assert 10 * np.log10(255**2 / np.mean((shown - expected) ** 2)) > MIN_PSNR
-        assert np.abs(frame.alpha / 255.0 - alpha).mean() < 0.01
+        served, expected = pipeline.paint(avatar, points), exact.paint(avatar, source, points)
+        assert psnr(served.over((0, 0, 0)), expected.over((0, 0, 0))) > MIN_PSNR
+        off = cv2.absdiff(served.alpha, expected.alpha)
+        assert off.mean() < 255 * 0.01
 
 
-def inputs(source: Source) -> list[torch.Tensor]:
-    anchor = np.zeros((1, MAX_SHELL_POINTS), np.int64)
-    anchor[0, : len(source.deformation.shell_anchor)] = source.deformation.shell_anchor
-    each = source.network_input, source.points, source.visible.astype(np.float32)
-    return [*(torch.from_numpy(x)[None] for x in each), torch.from_numpy(anchor)]
+def test_the_page_of_both_engines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    engine_page.main([str(tmp_path), str(PORTRAIT)])
+    assert "| astronaut |" in capsys.readouterr().out
+    page = (tmp_path / "index.html").read_text()
+    assert page.count("<img") == 3 * len(engine_page.POSES)
 
 
 def test_descriptors_are_the_ones_of_the_float_network(
-    pipeline: Pipeline, avatar: Avatar, model: CVTHead, source: Source
+    avatar: Avatar, exact: FloatNetwork, source: Source
 ) -> None:
-    expected = model.describe(*inputs(source))[0, : len(avatar.descriptors)].numpy()
+    expected = exact.describe(source)[0, : len(avatar.descriptors)].numpy()
     steps = avatar.descriptors.astype(np.float32) - ZERO
     # Codes are a multiple of the descriptors, channel by channel.
     largest = (steps * expected).sum(0) / (steps * steps).sum(0)

@@ -24,7 +24,7 @@ from cvthead.points import PointLayout
 from cvthead.source import read_source
 from cvthead.tracking.tracker import Tracker
 from cvthead.training import records
-from cvthead.training.config import TrainConfig, load_config
+from cvthead.training.config import TrainConfig, load_config, merged, setting
 from cvthead.training.dataset import PairDataset, flip_order, flip_points
 from cvthead.training.perceptual import perceptual_weights
 from cvthead.training.train import train
@@ -129,6 +129,28 @@ def test_without_deformation_no_shell_is_drawn(
     assert torch.equal(haired["image"], bald["image"])
 
 
+def test_the_mirror_image_of_a_still_carries_no_hair_across_the_face(
+    folder: Path, head: HeadModel, layout: PointLayout
+) -> None:
+    sample = PairDataset(folder, head, layout, size=64, seed=1, samples=4, augment=False)[0]
+    own, mirror = sample["seen"][:, layout.surface :]
+    assert own.max() == 1
+    assert mirror.max() == 0
+    assert torch.equal(*sample["seen"][:, : layout.surface])
+
+
+def test_without_augmentation_the_picture_stays(
+    folder: Path, head: HeadModel, layout: PointLayout
+) -> None:
+    dataset = PairDataset(folder, head, layout, size=256, seed=1, samples=4, augment=False)
+    (stored,) = records.stored_records(folder)
+    frame = stored.open().frame(0)
+    for number in range(4):
+        # The second view of a still is its mirror image, augmented or not.
+        picture = dataset[number]["image"][0].permute(1, 2, 0).numpy() * 255
+        assert np.abs(picture - frame.image).max() < 0.01
+
+
 def test_flip_is_its_own_inverse(layout: PointLayout) -> None:
     rng = np.random.default_rng(0)
     points = rng.normal(size=(layout.total, 3)).astype(np.float32)
@@ -215,6 +237,16 @@ def test_shipped_configurations_are_valid() -> None:
     assert load_config("paper-stage2", {}).stage == 2
 
 
+def test_single_keys_are_set_from_the_command_line() -> None:
+    given = merged(setting("losses.dice=0.5"), setting("features=pixel-aligned"))
+    config = load_config("open", merged(given, setting("losses.l1 = 2")))
+    assert config.features == "pixel-aligned"
+    assert (config.losses.dice, config.losses.l1, config.losses.perceptual) == (0.5, 2, 3)
+    for text in ("steps", "=3", "a b=3"):
+        with pytest.raises(InputError, match="sets no key"):
+            setting(text)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -222,6 +254,7 @@ def test_shipped_configurations_are_valid() -> None:
         ("steps = 3\nspeed = 2", "speed: "),
         ("steps = 3\nsize = 100", "size: "),
         ("steps = 3\nstage = 2", "losses.adversarial"),
+        ("steps = 3\npreset = 'paper'\nfeatures = 'transformer'", "remove features"),
         ("steps = 3\n[losses]\nidentity = 0.1", "networks.identity"),
         ("steps = ", "not TOML"),
     ],

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from made_loss_networks import made_identity, made_vgg
 from made_records import make_records
 from torch import Tensor
 
@@ -16,28 +17,12 @@ from cvthead.training.discriminator import (
     adversarial_losses,
     discriminator_loss,
 )
-from cvthead.training.identity import IdentityDistance, VGGFace2ResNet50
+from cvthead.training.identity import IdentityDistance
 from cvthead.training.perceptual import perceptual_weights
 from cvthead.training.train import train
-from cvthead.training.vgg import BLOCKS, VGGDistance, vgg_features
+from cvthead.training.vgg import VGGDistance
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-def made_vgg(path: Path, name: str) -> Path:
-    """Seeded weights under torchvision's key names, classifier included."""
-    torch.manual_seed(0)
-    features = vgg_features(BLOCKS[name]).state_dict()
-    state = {f"features.{key}": value for key, value in features.items()}
-    torch.save(state | {"classifier.0.weight": torch.zeros(1)}, path)
-    return path
-
-
-def made_identity(path: Path) -> Path:
-    torch.manual_seed(1)
-    state = VGGFace2ResNet50().state_dict()
-    torch.save(state | {"fc.weight": torch.zeros(8631, 2048), "fc.bias": torch.zeros(8631)}, path)
-    return path
 
 
 def views() -> tuple[Tensor, Tensor]:
@@ -135,6 +120,19 @@ def test_ablations_train_only_their_own_branch(features: str, folder: Path, tmp_
     assert any(n.startswith("transformer.") for n in moved) == (features == "transformer")
     assert any(n.startswith("encoder.to_pixels") for n in moved) == (features != "transformer")
     assert any(n.startswith("unet.") for n in moved)
+
+
+def test_paper_preset_trains_on_pixel_aligned_features(folder: Path, tmp_path: Path) -> None:
+    networks = {"perceptual": str(made_vgg(tmp_path / "vgg.pth", "VGG-16"))}
+    config = settings(
+        folder, tmp_path, preset="paper", features="pixel-aligned", size=32, networks=networks
+    )
+    state = torch.load(train(config), weights_only=True)
+    moved = [moments["exp_avg"].abs().sum() > 0 for moments in state["optimizer"]["state"].values()]
+    assert any(name.startswith("extractor.") for name in state["model"])
+    assert not any(name.startswith("transformer.") for name in state["model"])
+    # A convolution before a batch norm has a bias without effect.
+    assert sum(moved) > len(moved) / 2
 
 
 def test_paper_preset_trains_in_both_stages(folder: Path, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from cvthead.cli.picture import (
     check_size,
     write_picture,
 )
-from cvthead.cli.portrait import add_portrait_options, read_avatar
+from cvthead.cli.portrait import add_model_option, add_portrait_options, read_avatar
 from cvthead.composite import Composer
 from cvthead.preset import AnyAvatar, Preset, load_preset
 from cvthead.video_writer import video_writer
@@ -31,6 +31,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         description="Animate a portrait. A driving video's sound is kept in .mp4 files.",
     )
     add_portrait_options(parser, "portrait", "picture of a face, or an .avatar file")
+    add_model_option(parser)
     parser.add_argument(
         "--driving",
         type=Path,
@@ -70,7 +71,7 @@ def run(args: argparse.Namespace) -> None:
     endings = tuple(dict.fromkeys([*VIDEO_ENDINGS, *IMAGE_FORMATS]))
     check_output(args.output, endings, alpha=args.background == "transparent")
     check_size(args.size)
-    pipeline = load_preset(args.preset)
+    pipeline = load_preset(args.preset, model=args.model)
     avatar = read_avatar(pipeline, args.portrait, args.face)
     options = Options(args.relative, args.camera == "driver", not args.no_smoothing)
     drive = open_driver(args.driving, pipeline, avatar, options)

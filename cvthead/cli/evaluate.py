@@ -14,6 +14,7 @@ from cvthead.deformation import DeformationModel
 from cvthead.errors import AssetError, InputError
 from cvthead.pipeline import Pipeline
 from cvthead.preset import Preset, load_preset
+from cvthead.runtime.model_folder import ModelFolder
 
 if TYPE_CHECKING:
     from cvthead.evaluation.identity import Embed
@@ -102,11 +103,16 @@ def run(args: argparse.Namespace) -> None:
 
     networks = UserNetworks.load(**{name: getattr(args, f"{name}_network") for name in NETWORKS})
     pipelines = load_models(args.preset, args.model)
-    methods = {name: trained(pipeline) for name, pipeline in pipelines.items()}
+    haired = has_deformation(args.model)
+    methods = {
+        name: trained(pipeline, deform=haired.get(name, True))
+        for name, pipeline in pipelines.items()
+    }
     if args.without_deformation:
         methods |= {
             f"{name}, no deformation": trained(pipeline, deform=False)
             for name, pipeline in pipelines.items()
+            if haired.get(name, True)
         }
     tracker = Tracker.load()
     deformer = DeformationModel.from_head(tracker.head)
@@ -145,6 +151,15 @@ def load_models(preset: str, models: Sequence[str]) -> dict[str, Preset[Any]]:
                 f"--model {text} has no name of its own", hint="use NAME=FOLDER, each name once"
             )
         found[name] = Pipeline.load(model=Path(folder))
+    return found
+
+
+def has_deformation(models: Sequence[str]) -> dict[str, bool]:
+    """Whether the models of :func:`load_models` were trained with hair and shoulders."""
+    found = {}
+    for text in models:
+        name, _, folder = text.partition("=")
+        found[name] = ModelFolder.load(Path(folder)).training.get("deformation") != "false"
     return found
 
 

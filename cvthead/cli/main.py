@@ -18,6 +18,7 @@ from cvthead.cli import (
     data,
     encode,
     evaluate,
+    finetune,
     import_official,
     render,
     sweep,
@@ -27,7 +28,10 @@ from cvthead.cli import (
 from cvthead.errors import CVTHeadError, InputError, SeveralFacesError
 from cvthead.runtime.threads import one_thread_per_call
 
-COMMANDS = (encode, render, animate, track, sweep, bench, import_official, data, train, evaluate)
+COMMANDS = (
+    *(encode, render, animate, track, sweep, bench, import_official),
+    *(data, train, finetune, evaluate),
+)
 FAILED = 2
 INTERRUPTED = 130  # what shells report for a command ended by Ctrl-C
 

@@ -28,6 +28,15 @@ def add_preset_option(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_model_option(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--model",
+        type=Path,
+        metavar="FOLDER",
+        help="another model of the preset, such as `cvthead finetune` writes",
+    )
+
+
 def preset(name: str) -> str:
     """Parse ``--preset``.
 

@@ -16,6 +16,7 @@ from cvthead.cli.picture import (
     check_size,
     write_picture,
 )
+from cvthead.cli.portrait import add_model_option
 from cvthead.cli.values import vector, weights
 from cvthead.coefficients import Coefficients
 from cvthead.composite import Composer
@@ -62,6 +63,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         default="absolute",
         help="values replace the portrait's (absolute, the default) or are added to them",
     )
+    add_model_option(parser)
     add_picture_options(parser)
     parser.set_defaults(run=run)
 
@@ -71,7 +73,7 @@ def run(args: argparse.Namespace) -> None:
     check_size(args.size)
     avatar = load_avatar(args.avatar)
     controls = controls_of(args, avatar.coefficients)
-    pipeline = load_preset(avatar.preset)
+    pipeline = load_preset(avatar.preset, model=args.model)
     composer = Composer.of(args.background, args.size, pipeline.background(avatar))
     frame = pipeline.render(avatar, controls)
     write_picture(args.output, composer.picture(frame), composer.source)

@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from cvthead.camera import CROP_PIXELS, Camera
 from cvthead.cli.picture import IMAGE_FORMATS, check_output, write_picture
-from cvthead.cli.portrait import add_portrait_options, read_avatar
+from cvthead.cli.portrait import add_model_option, add_portrait_options, read_avatar
 from cvthead.coefficients import EXPRESSION_SIZE, SHAPE_SIZE, Coefficients
 from cvthead.composite import resampled
 from cvthead.controls import Controls, resolve
@@ -91,6 +91,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         description="Write a grid of pictures: rows of shape, expression, jaw and view.",
     )
     add_portrait_options(parser, "portrait", "picture of a face, or an .avatar file")
+    add_model_option(parser)
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="PICTURE")
     parser.add_argument(
         "--cell", type=int, default=160, metavar="N", help="side of a cell in pixels (160)"
@@ -102,7 +103,7 @@ def run(args: argparse.Namespace) -> None:
     check_output(args.output, tuple(IMAGE_FORMATS), alpha=False)
     if not 32 <= args.cell <= CROP_PIXELS:
         raise InputError(f"--cell {args.cell} is out of range", hint=f"use 32 to {CROP_PIXELS}")
-    pipeline = load_preset(args.preset)
+    pipeline = load_preset(args.preset, model=args.model)
     avatar = read_avatar(pipeline, args.portrait, args.face)
     write_picture(args.output, grid(pipeline, avatar, args.cell), SourceType.GENERATED)
     print(args.output)

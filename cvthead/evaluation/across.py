@@ -28,6 +28,8 @@ from cvthead.evaluation.shots import Image, Shot
 from cvthead.evaluation.table import Table
 from cvthead.tracking.tracker import Tracker
 
+CROSS, TURNED = "Cross-identity", "Turned"
+
 
 @dataclass(frozen=True, eq=False)
 class Crossing:
@@ -93,8 +95,8 @@ def cross_tables(
     each: int,
     networks: UserNetworks,
     speeds: Mapping[str, NDArray[np.float64]],
-) -> tuple[list[Table], dict[str, list[Grid]]]:
-    """Tables of cross-identity and of turned heads, and their pictures.
+) -> tuple[dict[str, list[Table]], dict[str, list[Grid]]]:
+    """Tables of cross-identity and of turned heads, and their pictures, by heading.
 
     Args:
         each: drivers per source.
@@ -102,22 +104,22 @@ def cross_tables(
     """
     scale = scale_of(clips)
     turned, turned_grids = turns(bench, clips)
-    tables = [turned_table(turned, scale)]
+    sections: dict[str, list[Table]] = {CROSS: [], TURNED: [turned_table(turned, scale)]}
     done = crossings(bench, clips, each, networks.csim)
     if not done:  # a single person
-        return tables, {"Turned": turned_grids}
+        return sections, {TURNED: turned_grids}
     names = list(done[0].made)
-    tables.insert(0, cross_table([one.found for one in done], scale))
-    tables.append(
+    sections[CROSS] = [
+        cross_table([one.found for one in done], scale),
         paper_table(
             networks,
             [picture(clip.source) for clip in clips],
             {name: [one.made[name] for one in done] for name in names},
             {name: [o.cosines[name] for o in done if name in o.cosines] for name in names},
             speeds,
-        )
-    )
-    return tables, {"Cross-identity": crossing_grids(done), "Turned": turned_grids}
+        ),
+    ]
+    return sections, {CROSS: crossing_grids(done), TURNED: turned_grids}
 
 
 def turns(bench: Bench, clips: Sequence[Clip]) -> tuple[list[dict[str, Found | None]], list[Grid]]:

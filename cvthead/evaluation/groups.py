@@ -52,12 +52,15 @@ class Reconstruction:
 
 
 def read_stills(data: Path) -> list[Still]:
-    """The stills of the split ``val`` of ``stills.csv``; those without a label go by their set.
+    """The stills of the split ``val`` of ``stills.csv``, none without that table; those without a
+    label go by their set.
 
     Raises:
-        InputError: no table, or without the columns file, split, set and group.
+        InputError: the table cannot be read, or lacks the columns file, split, set and group.
     """
     path = data / "stills.csv"
+    if not path.exists():
+        return []
     try:
         with path.open(encoding="utf-8", newline="") as file:
             return [

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
 from tqdm import tqdm
 
 from cvthead.errors import FaceError, InputError
-from cvthead.evaluation.across import cross_tables
+from cvthead.evaluation.across import CROSS, cross_tables
 from cvthead.evaluation.big_pose import DEGREES
 from cvthead.evaluation.clip import Bench, Clip, measure_clip
 from cvthead.evaluation.groups import (
     Reconstruction,
+    Still,
     group_tables,
     read_stills,
     reconstruct,
@@ -27,8 +30,8 @@ from cvthead.evaluation.page import Grid, write_page
 from cvthead.evaluation.paper_metrics import UserNetworks
 from cvthead.evaluation.reenactment import paper_table, part_table, score_table
 from cvthead.evaluation.report import Report
-from cvthead.evaluation.speed import frames_per_second
-from cvthead.evaluation.steadiness import steadiness_table
+from cvthead.evaluation.speed import frames_per_second, speed_table
+from cvthead.evaluation.steadiness import STRETCH, steadiness_table
 from cvthead.evaluation.sweep import sweep
 from cvthead.evaluation.table import Table
 from cvthead.evaluation.two_sources import likeness_table
@@ -38,8 +41,16 @@ from cvthead.preset import Preset
 
 T = TypeVar("T")
 
-SELF, CROSS, STEADY = "Self-reenactment", "Cross-identity", "Steadiness"
-BIG, SOURCES, GROUPS, SWEEP = "Big poses", "Two sources of one person", "Groups", "Sweep"
+SELF, BIG, STEADY, SPEED = "Self-reenactment", "Big poses", "Steadiness", "Speed"
+SOURCES, GROUPS, SWEEP = "Two sources of one person", "Groups", "Sweep"
+# Of the parts that can come to nothing: heading, and why.
+NOTHING = {
+    "big": (BIG, f"no clip has two frames more than {DEGREES:.0f} degrees apart"),
+    "cross": (CROSS, "it takes two clips with a trackable face"),
+    "steady": (STEADY, f"no clip shows a trackable face in {STRETCH} frames in a row"),
+    "sources": (SOURCES, "no clip shows a trackable face in its middle frame"),
+    "groups": (GROUPS, "the data holds no stills.csv, or no still of its split val is trackable"),
+}
 
 
 @dataclass(frozen=True)
@@ -72,36 +83,32 @@ def evaluate(
         pipelines: whose speed is measured, by method.
 
     Raises:
-        InputError: no clips, or none in which a face can be tracked.
+        InputError: no clips, none in which a face can be tracked, or a damaged table of stills.
     """
     seconds: dict[str, float] = {}
+    stills = read_stills(plan.data) if "groups" in bench.parts else []
     clips = timed(seconds, "clips", lambda: measure_clips(bench, plan))
     sections = clip_sections(bench, clips)
     grids = clip_grids(clips, plan.people)
-    first, driver = clips[0].source, clips[0].lent[-1]
-    speeds = {}
+    speeds: dict[str, NDArray[np.float64]] = {}
     if "speed" in bench.parts:
-        speeds = timed(
-            seconds,
-            "speed",
-            lambda: {
-                name: frames_per_second(pipeline, first, driver, plan.runs)
-                for name, pipeline in pipelines.items()
-            },
-        )
+        speeds = timed(seconds, "speed", lambda: measure_speed(clips[0], pipelines, plan.runs))
+        sections[SPEED] = [speed_table(speeds, plan.runs)]
     if "cross" in bench.parts:
         tables, pictures = timed(
             seconds,
             "cross-identity",
             lambda: cross_tables(bench, clips, plan.crossings, networks, speeds),
         )
-        sections[CROSS] = tables
+        sections |= tables
         grids |= {heading: some[: plan.people] for heading, some in pictures.items()}
     if "groups" in bench.parts:
-        sections[GROUPS] = timed(seconds, "groups", lambda: measure_groups(bench, plan))
+        some = stills[:: plan.every]
+        sections[GROUPS] = timed(seconds, "groups", lambda: measure_groups(bench, some))
     if "self" in bench.parts:
-        grids[SWEEP] = sweeps(bench, spread(clips, plan.people))
-    report = Report(about(bench, clips), sections, seconds)
+        arkit = pipelines[bench.trained[0]].arkit
+        grids[SWEEP] = sweeps(bench.trained[0], arkit, spread(clips, plan.people))
+    report = Report(about(bench, clips), sections, absent(bench.parts, sections), seconds)
     plan.output.mkdir(parents=True, exist_ok=True)
     write_file(plan.output / "report.md", report.markdown().encode())
     text = json.dumps(report.json(), indent=1, allow_nan=False)
@@ -202,9 +209,18 @@ def clip_grids(clips: Sequence[Clip], people: int) -> dict[str, list[Grid]]:
     }
 
 
-def measure_groups(bench: Bench, plan: Plan) -> list[Table]:
-    """Every n-th still of each set, by group."""
-    stills = read_stills(plan.data)[:: plan.every]
+def measure_speed(
+    clip: Clip, pipelines: Mapping[str, Preset[Any]], runs: int
+) -> dict[str, NDArray[np.float64]]:
+    """Of each trained method, with a source and a driver of one clip."""
+    return {
+        name: frames_per_second(pipeline, clip.source, clip.lent[-1], runs)
+        for name, pipeline in pipelines.items()
+    }
+
+
+def measure_groups(bench: Bench, stills: Sequence[Still]) -> list[Table]:
+    """Same and mirrored picture of each still, by group."""
     done: list[Reconstruction] = []
     for still in tqdm(stills, desc="stills", unit="still"):
         shots = shots_of(bench.tracker, still)
@@ -218,19 +234,27 @@ def measure_groups(bench: Bench, plan: Plan) -> list[Table]:
     return group_tables(done, len(stills)) if done else []
 
 
-def sweeps(bench: Bench, clips: Sequence[Clip]) -> list[Grid]:
-    """The first trained method under a fixed series of poses and expressions. Only the open
-    preset's expressions are those of the ARKit map."""
+def sweeps(name: str, arkit: ArkitMap, clips: Sequence[Clip]) -> list[Grid]:
+    """One method under a fixed series of poses and expressions.
+
+    Args:
+        arkit: of the method's own head model.
+    """
     grids = []
-    arkit = ArkitMap.load()
     for clip in clips:
-        person = clip.persons[bench.trained[0]]
-        if person.preset == "open":
-            pictures = sweep(person.head, arkit, person.coefficients, person.camera, person.draw)
-            grids.append(
-                Grid(clip.source.name, list(pictures), {bench.trained[0]: [*pictures.values()]})
-            )
+        person = clip.persons[name]
+        pictures = sweep(person.head, arkit, person.coefficients, person.camera, person.draw)
+        grids.append(Grid(clip.source.name, list(pictures), {name: [*pictures.values()]}))
     return grids
+
+
+def absent(parts: Collection[str], sections: Mapping[str, Sequence[Table]]) -> dict[str, str]:
+    """Heading -> why there is no table of a part that was asked for."""
+    return {
+        heading: reason
+        for part, (heading, reason) in NOTHING.items()
+        if part in parts and not sections.get(heading)
+    }
 
 
 def about(bench: Bench, clips: Sequence[Clip]) -> list[str]:

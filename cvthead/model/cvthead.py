@@ -115,14 +115,15 @@ class CVTHead(nn.Module):
         Returns:
             RGB (b, 3, size, size) in [-1, 1] and mask logits (b, 1, size, size).
         """
-        if self.config.features == "transformer":
-            seen, warped = torch.zeros_like(seen), torch.zeros_like(warped)
+        carry = self.config.features != "transformer"
+        if not carry:
+            seen = torch.zeros_like(seen)
         values = torch.cat([descriptors, seen[..., None]], dim=-1)
         image = splat(points, values, warped.shape[-1] // self.config.unet_unshuffle)
         with torch.autocast(image.device.type, enabled=False):
             filled = self.filled(image)
         out: tuple[Tensor, Tensor] = self.unet(
-            filled.contiguous(memory_format=torch.channels_last), warped
+            filled.contiguous(memory_format=torch.channels_last), warped, carry=carry
         )
         return out
 

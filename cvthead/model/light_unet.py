@@ -63,24 +63,29 @@ class LightUNet(nn.Module):
             assert self.to_image.bias is not None
             self.to_image.bias[4] += GATE_BIAS
 
-    def forward(self, splat: Tensor, warped: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(
+        self, splat: Tensor, warped: Tensor, *, carry: bool = True
+    ) -> tuple[Tensor, Tensor]:
         """Paint a frame.
 
         Args:
             splat: (b, size_in, h / unshuffle, w / unshuffle).
             warped: (b, 4, h, w), the portrait's RGB in [-1, 1] and mask, carried to the pose.
+            carry: False does without the warped portrait: an ablation.
 
         Returns:
             RGB (b, 3, h, w) in [-1, 1]: warped pixels and painted ones, mixed by a learned gate;
             mask logits (b, 1, h, w).
         """
+        if not carry:
+            warped = torch.zeros_like(warped)
         x = self.stem(torch.cat([splat, F.pixel_unshuffle(warped, self.unshuffle)], dim=1))
         x = F.pixel_shuffle(self.after_stem(x), self.unshuffle)
         # 0..1, so that the zeros beyond the border are black and transparent.
-        portrait = torch.cat([warped[:, :3] * 0.5 + 0.5, warped[:, 3:]], dim=1)
+        portrait = torch.cat([warped[:, :3] * 0.5 + 0.5, warped[:, 3:]], dim=1) * carry
         out = self.to_image(torch.cat([x, portrait.to(x.dtype)], dim=1)).float()
         out = even(torch.cat([clipped(out[:, :3]), out[:, 3:]], dim=1))
-        gate = torch.sigmoid(out[:, 4:])
+        gate = torch.sigmoid(out[:, 4:]) * carry
         if self.training:
             gate = gate * (torch.rand(len(gate), 1, 1, 1) > GATE_DROPOUT)
         return gate * warped[:, :3] + (1 - gate) * out[:, :3], out[:, 3:4]

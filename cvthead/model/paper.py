@@ -18,8 +18,6 @@ from cvthead.model.splat import splat_clamped
 from cvthead.model.transformer import Transformer
 from cvthead.model.unet import UNet
 
-HARD_MASK = 0.6
-
 
 class PaperCVTHead(nn.Module):
     """Vertex-feature transformer and neural vertex renderer (paper section 3).
@@ -74,21 +72,3 @@ class PaperCVTHead(nn.Module):
         """
         out = self.unet(splat_clamped(projected, descriptors, size))
         return torch.tanh(out[:, :3]), out[:, 3:]
-
-
-def over_white(rgb: Tensor, mask_logits: Tensor, threshold: float | None = None) -> Tensor:
-    """The painted head over white, as the released code writes it.
-
-    Args:
-        rgb: (b, 3, h, w) in [-1, 1].
-        mask_logits: (b, 1, h, w).
-        threshold: None blends by the mask; a number (HARD_MASK) cuts it there first.
-
-    Returns:
-        (b, h, w, 3) uint8; truncated, not rounded.
-    """
-    mask = torch.sigmoid(mask_logits)
-    if threshold is not None:
-        mask = (mask > threshold).to(rgb.dtype)
-    image = 0.5 * (rgb + 1) * mask + (1 - mask)
-    return (image * 255).to(torch.uint8).permute(0, 2, 3, 1)

@@ -97,7 +97,9 @@ def resume(path: Path, fabric: Fabric, config: TrainConfig, state: RunState) -> 
             f"{path} cannot be continued, it lacks its configuration",
             hint="start a new run folder from it with --init",
         )
-    changed = sorted(key for key in now if before.get(key) != now[key])
+    # A key that is newer than the checkpoint had its default's effect.
+    before = TrainConfig(steps=config.steps).fixed() | before
+    changed = sorted(key for key in now if before[key] != now[key])
     if changed:
         raise InputError(
             f"the run in {path.parent} was begun with other settings: {', '.join(changed)}",

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from collections.abc import Mapping
+from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -72,9 +74,13 @@ class TrainConfig(Section):
 
     Attributes:
         preset: network: "open", or "paper" on the open head.
-        features: of the open preset, see cvthead.model.config; the ablations.
+        features: "fused" is the preset's own network; the others are ablations, see
+            cvthead.model.config. The preset paper has "pixel-aligned" alone.
         deformation: False trains on bald heads.
+        augmentation: False leaves the pictures as they are, to learn few of them by heart.
         data: folder of records, such as the ``train`` folder of ``cvthead data prepare``.
+        labels: CSV table (file, group) of the stills in ``data``, of which every group is then seen
+            alike.
         run: folder of checkpoint and logs.
         init: checkpoint.pt of another run, a weights.safetensors, or "shipped"; None starts
             from random weights.
@@ -94,7 +100,9 @@ class TrainConfig(Section):
     preset: Literal["open", "paper"] = "open"
     features: Features = "fused"
     deformation: bool = True
+    augmentation: bool = True
     data: Path = Path("records")
+    labels: Path | None = None
     run: Path = Path("run")
     init: str | None = None
     size: int = Field(default=256, ge=32, multiple_of=32)
@@ -116,8 +124,8 @@ class TrainConfig(Section):
     def _consistent(self) -> Self:
         if self.losses.identity and self.networks.identity is None:
             raise ValueError("losses.identity needs a file in networks.identity")
-        if self.preset == "paper" and self.features != "fused":
-            raise ValueError("features chooses a branch of the open preset; remove it")
+        if self.preset == "paper" and self.features == "transformer":
+            raise ValueError("the paper's network is the transformer; remove features")
         if self.stage == 2 and not self.losses.adversarial:
             raise ValueError("stage 2 needs a factor in losses.adversarial")
         return self
@@ -132,7 +140,7 @@ def load_config(name: str, given: Mapping[str, Any]) -> TrainConfig:
 
     Args:
         name: a TOML file, or the name of a shipped one.
-        given: values that replace the file's.
+        given: values that replace the file's; those of a section replace that key alone.
 
     Raises:
         InputError: no such file, not TOML, unknown keys, or wrong values.
@@ -150,7 +158,7 @@ def load_config(name: str, given: Mapping[str, Any]) -> TrainConfig:
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InputError(f"{name} is not TOML: {error}", hint="correct the file") from error
     try:
-        return TrainConfig.model_validate({**values, **given})
+        return TrainConfig.model_validate(merged(values, given))
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
@@ -158,3 +166,26 @@ def load_config(name: str, given: Mapping[str, Any]) -> TrainConfig:
             f"{name}: {key + ': ' if key else ''}{first['msg']}",
             hint="docs/training.md explains the keys",
         ) from error
+
+
+def merged(values: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """``values`` with those of ``given`` in their place, section by section."""
+    out = dict(values)
+    for key, new in given.items():
+        old = out.get(key)
+        both = isinstance(old, Mapping) and isinstance(new, Mapping)
+        out[key] = merged(old, new) if both else new  # type: ignore[arg-type]
+    return out
+
+
+def setting(text: str) -> dict[str, Any]:
+    """``KEY=VALUE`` as :func:`load_config` takes it; a text needs no quotes.
+
+    Raises:
+        InputError: not of this form.
+    """
+    key, equals, value = text.partition("=")
+    for written in (value, json.dumps(value)) if equals else ():
+        with suppress(tomllib.TOMLDecodeError):
+            return tomllib.loads(f"{key} = {written}")
+    raise InputError(f"{text!r} sets no key", hint="write KEY=VALUE, for example losses.dice=0.5")

@@ -22,7 +22,7 @@ from cvthead.driving import at_neck
 from cvthead.head.model import HeadModel
 from cvthead.model.config import OPEN
 from cvthead.points import FAR_AWAY, PointLayout
-from cvthead.runtime.place import place
+from cvthead.runtime.place import Placed, place
 from cvthead.source import (
     as_network_input,
     driven_points,
@@ -30,8 +30,9 @@ from cvthead.source import (
     places,
     portrait_pixels,
 )
-from cvthead.training.details import ZOOMED, detail_weights, zoom_corner
+from cvthead.training.details import ZOOMED, detail_weights, unseen_weights, zoom_corner
 from cvthead.training.records import Frame, stored_records
+from cvthead.training.sampling import group_shares, turned_still
 from cvthead.visibility import inside_mask, on_person
 
 Array = NDArray[np.float32]
@@ -45,12 +46,17 @@ STRONG_COLOUR_SHARE = 0.4
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A driven view: image (S, S, 3) 0..1, mask, valid (S, S) and points (P, 3)."""
+    """A driven view: image (S, S, 3) 0..1, mask, valid (S, S) and points (P, 3).
+
+    Shell points have no counterpart across the face. In the mirror image of the source they lie
+    where the source shows something else, so nothing is carried there.
+    """
 
     image: Array
     mask: Array
     valid: Array
     points: Array
+    carries_shell: bool = True
 
 
 class PairDataset(Dataset[dict[str, Tensor]]):
@@ -66,22 +72,27 @@ class PairDataset(Dataset[dict[str, Tensor]]):
         seed: int,
         samples: int,
         deform: bool = True,
+        augment: bool = True,
+        labels: Path | None = None,
     ) -> None:
         """Args:
         folder: records of cvthead.data, see cvthead.training.records.
         size: of the driven views, pixels.
         samples: length.
         deform: False leaves the heads bald: the ablation without deformation.
+        augment: False takes pictures as they are, neither mirrored nor recoloured nor zoomed.
+        labels: table of the stills' groups, see cvthead.training.sampling.
 
         Raises:
-            InputError: no records in the folder.
+            InputError: no records in the folder, or no table of labels.
         """
-        self.deform = deform
+        self.deform, self.augment = deform, augment
         self.head, self.layout = head, layout
         self.size, self.seed, self.samples = size, seed, samples
         stored = stored_records(folder)
         self.clips = [record for record in stored if record.frames > 1]
         self.stills = [record for record in stored if record.frames == 1]
+        self.shares = group_shares(self.stills, labels)
 
     def __len__(self) -> int:
         return self.samples
@@ -90,8 +101,11 @@ class PairDataset(Dataset[dict[str, Tensor]]):
         cv2.setNumThreads(1)
         rng = np.random.default_rng((self.seed, index))
         use_clip = bool(self.clips) and (not self.stills or rng.random() < CLIP_SHARE)
-        among = self.clips if use_clip else self.stills
-        record = among[int(rng.integers(len(among)))].open()
+        record = (
+            self.clips[int(rng.integers(len(self.clips)))].open()
+            if use_clip
+            else turned_still(rng, self.stills, self.shares)
+        )
         number = int(rng.choice(record.sources))
         source = record.frame(number)
         deformation = record.deformation(number) if self.deform else Deformation.none(self.head)
@@ -113,9 +127,11 @@ class PairDataset(Dataset[dict[str, Tensor]]):
                 views.append(as_view(frame, points(frame)))
         else:
             view = as_view(source, own)
-            views = [view, mirrored(view, self.layout)]
-        colours = colour_jitter(rng)
-        image, mask, own = jittered(rng, source, own)
+            views = [view, replace(mirrored(view, self.layout), carries_shell=False)]
+        colours = colour_jitter(rng) if self.augment else UNCHANGED
+        image, mask = source.image, source.mask
+        if self.augment:
+            image, mask, own = jittered(rng, source, own)
         image = np.round(
             np.clip(colours(image.astype(np.float32) / np.float32(255)), 0, 1) * 255
         ).astype(np.uint8)
@@ -123,7 +139,7 @@ class PairDataset(Dataset[dict[str, Tensor]]):
         network = network_input(image, mask)
         visible *= inside_mask(own, mask)
         drawn = on_person(own, mask)
-        if rng.random() < 0.5:  # the whole sample seen in a mirror
+        if self.augment and rng.random() < 0.5:  # the whole sample seen in a mirror
             network = network[:, :, ::-1]
             own, visible = flip_points(own, self.layout), flip_order(visible, self.layout)
             drawn = flip_order(drawn.astype(np.float32), self.layout) > 0
@@ -134,21 +150,28 @@ class PairDataset(Dataset[dict[str, Tensor]]):
         at = places(self.layout, own, visible > 0)
         portrait = portrait_pixels(network)
         zoomed = int(rng.integers(len(ZOOMED)))
+        ats = [at if v.carries_shell else without_shell(at, self.layout) for v in views]
+        placed = [self._placed(each, its, portrait) for each, its in zip(driven, ats, strict=True)]
         stack: dict[str, NDArray[Any]] = {
             "source": network,
             "points": own,
             "visible": visible,
-            "seen": at[:, 2],
+            "seen": np.stack([each[:, 2] for each in ats]),
             "anchor": anchor,
             "window": rng.random(3),
             "zoom": np.array([zoom_corner(each, zoomed, self.size) for each in landmarks]),
-            "weight": np.stack([detail_weights(each, self.size)[None] for each in landmarks]),
+            "weight": np.stack(
+                [
+                    np.maximum(detail_weights(marks, self.size), unseen_weights(each))[None]
+                    for marks, each in zip(landmarks, placed, strict=True)
+                ]
+            ),
             "background": np.full((VIEWS, 3, 1, 1), 1, np.float32) * rng.random((1, 3, 1, 1)),
             "image": np.stack([self._resized(v.image).transpose(2, 0, 1) for v in views]),
             "mask": np.stack([self._resized(v.mask)[None] for v in views]),
             "valid": np.stack([self._resized(v.valid)[None] > 0.99 for v in views]),
             "driven": np.stack(driven),
-            "warped": np.stack([self._warped(each, at, portrait) for each in driven]),
+            "warped": np.stack([as_network_input(each.warped) for each in placed]),
         }
         return {
             name: torch.from_numpy(
@@ -157,18 +180,24 @@ class PairDataset(Dataset[dict[str, Tensor]]):
             for name, value in stack.items()
         }
 
-    def _warped(self, driven: Array, at: Array, portrait: NDArray[np.uint8]) -> Array:
-        """(4, S, S) portrait carried to the driven points, as a network input."""
+    def _placed(self, driven: Array, at: Array, portrait: NDArray[np.uint8]) -> Placed:
+        """The portrait carried to the driven points."""
         splat_size = self.size // OPEN.unet_unshuffle
         nothing = np.empty((len(driven), 0), np.uint8)
-        placed = place(self.layout, driven, at, nothing, portrait, splat_size)
-        return as_network_input(placed.warped)
+        return place(self.layout, driven, at, nothing, portrait, splat_size)
 
     def _resized(self, image: Array) -> Array:
         if image.shape[0] == self.size:
             return image
         size = (self.size, self.size)
         return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def without_shell(at: Array, layout: PointLayout) -> Array:
+    """Places (P, 3) of cvthead.source with the shell points not seen."""
+    out = at.copy()
+    out[layout.surface :, 2] = 0
+    return out
 
 
 def as_view(frame: Frame, points: Array) -> View:
@@ -194,6 +223,7 @@ def mirrored(view: View, layout: PointLayout) -> View:
         view.mask[:, ::-1],
         view.valid[:, ::-1],
         flip_points(view.points, layout),
+        view.carries_shell,
     )
 
 
@@ -223,6 +253,9 @@ class ColourJitter:
 
     def __call__(self, image: Array) -> Array:
         return np.asarray(np.clip(image @ self.matrix + np.float32(self.offset), 0, 1), np.float32)
+
+
+UNCHANGED = ColourJitter(np.eye(3, dtype=np.float32), 0.0)
 
 
 def colour_jitter(rng: np.random.Generator) -> ColourJitter:

@@ -1,10 +1,13 @@
-"""Eyes and mouth: few pixels, but where people look first, so they weigh more in training."""
+"""Pixels that weigh more in training: eyes and mouth, few but where people look first; and what the
+source hides, which is rare and hardest."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from cvthead.runtime.place import Placed
 
 Array = NDArray[np.float32]
 
@@ -16,6 +19,9 @@ LIPS = (61, 185, 40, 39, 37, 0, 267, 269, 270, 409, 291, 375, 321, 405, 314, 17,
 WEIGHTS = {RIGHT_EYE: 8.0, LEFT_EYE: 8.0, LIPS: 4.0}
 MARGIN = 0.012  # of the picture's side, added around each outline
 ZOOMED = (RIGHT_EYE + LEFT_EYE, LIPS)
+UNSEEN_WEIGHT = 3.0  # further weight, as well
+GAP = np.ones((9, 9), np.uint8)
+SEEN_CODE = 1  # in Placed.codes without descriptors: after the depth
 ZOOM_SIDE = 0.375  # of the picture's side
 
 
@@ -34,6 +40,16 @@ def detail_weights(landmarks: Array, size: int) -> Array:
         cv2.fillPoly(inside, [np.rint(pixels[list(outline)]).astype(np.int32)], 1)
         weights = np.maximum(weights, 1 + weight * cv2.dilate(inside, kernel))
     return np.asarray(weights, np.float32)
+
+
+def unseen_weights(placed: Placed) -> Array:
+    """(2s, 2s) weight of each pixel, 1 beside the head and where the source sees what is there."""
+    size = placed.reach.shape[::-1]
+    seen = cv2.resize(placed.codes[..., SEEN_CODE], size, interpolation=cv2.INTER_NEAREST)
+    hidden = ((seen == 0) & (placed.reach > 0)).astype(np.uint8)
+    # Between the points of a seen surface are gaps; they are thin.
+    wide = cv2.morphologyEx(hidden, cv2.MORPH_OPEN, GAP)
+    return 1 + np.float32(UNSEEN_WEIGHT) * wide.astype(np.float32)
 
 
 def zoom_corner(landmarks: Array, part: int, size: int) -> tuple[int, int]:

@@ -1,6 +1,6 @@
 """Turn a training checkpoint into the model folder that ships.
 
-    python -m cvthead.training.export RUN/checkpoint.pt cvthead/assets/open RECORDS
+    python -m cvthead.training.export RUN/checkpoint.pt MODEL RECORDS
 
 The folder holds ``weights.safetensors`` (half precision, what fine-tuning starts from), the
 networks ``describe.onnx`` and ``paint.onnx`` made from it, and ``model.json``.
@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -24,14 +25,19 @@ from torch import Tensor
 
 from cvthead import weights
 from cvthead.camera import CROP_PIXELS
+from cvthead.errors import InputError
+from cvthead.files import write_errors
 from cvthead.head.hierarchy import MeshHierarchy
 from cvthead.head.model import HeadModel
 from cvthead.model.config import OPEN
 from cvthead.model.cvthead import CVTHead
+from cvthead.model.light_unet import PIXEL_SIZE, PORTRAIT_SIZE
 from cvthead.points import PointLayout
+from cvthead.runtime.mix import LOGIT_RANGE
 from cvthead.runtime.model_folder import DESCRIBE, PAINT, WEIGHTS, write_record
 from cvthead.runtime.place import Placed, place
 from cvthead.source import places, portrait_pixels
+from cvthead.training.checkpoint import read
 from cvthead.training.dataset import PairDataset
 from cvthead.training.onnx_export import export_describe, export_paint
 from cvthead.training.quantise import feed, quantise
@@ -41,28 +47,58 @@ CALIBRATION, HELD_OUT = 32, 16
 SPLAT_SIZE = CROP_PIXELS // OPEN.unet_unshuffle
 DESCRIBE_INPUTS = ("source", "points", "visible", "anchor")
 SEED = 2  # of the calibration samples
+NOTES = ("licence", "data")
 DESCRIPTOR_SHARE = 0.9999  # the rest is clipped to the largest code
 FEATURE_SHARE = 0.9999
 
 
-def averaged_model(checkpoint: Path) -> tuple[CVTHead, int]:
-    """The averaged weights of a training run and their step."""
-    state = torch.load(checkpoint, weights_only=True)
-    model = CVTHead(OPEN, MeshHierarchy.load(), PointLayout.of(HeadModel.load()))
+def averaged_model(state: Mapping[str, Any]) -> CVTHead:
+    """The averaged weights of a checkpoint of the open preset.
+
+    Raises:
+        InputError: it is of the preset paper, which has no runtime.
+    """
+    config = state.get("config", {})
+    if config.get("preset", "open") != "open":
+        raise InputError(
+            f"a run of the preset {config['preset']} cannot be exported",
+            hint="the runtime knows the open preset; choose one of its checkpoints",
+        )
+    network = replace(OPEN, features=config.get("features", "fused"))
+    model = CVTHead(network, MeshHierarchy.load(), PointLayout.of(HeadModel.load()))
     averaged = {
         name.removeprefix("module."): value
         for name, value in state["averaged"].items()
         if name.startswith("module.")
     }
     model.load_state_dict(averaged)
-    return model, state["step"]
+    if network.features == "transformer":
+        forget_portrait(model)
+    return model
 
 
-def samples(records: Path, count: int) -> tuple[PointLayout, list[dict[str, NDArray[Any]]]]:
+@torch.no_grad()
+def forget_portrait(model: CVTHead) -> None:
+    """Make the frame network of this ablation ignore what it was trained without: the runtime
+    carries the portrait, and says what it sees, to every network."""
+    stem, last = model.unet.stem[0], model.unet.to_image
+    assert isinstance(stem, torch.nn.Conv2d)
+    assert last.bias is not None
+    stem.weight[:, 1 + model.config.descriptor_size] = 0  # seen
+    stem.weight[:, -PORTRAIT_SIZE * model.unet.unshuffle**2 :] = 0
+    last.weight[:, PIXEL_SIZE:] = 0
+    last.weight[4], last.bias[4] = 0, -LOGIT_RANGE  # the gate
+
+
+def samples(
+    records: Path, count: int, *, deform: bool
+) -> tuple[PointLayout, list[dict[str, NDArray[Any]]]]:
     """Training samples to calibrate on."""
     head = HeadModel.load()
     layout = PointLayout.of(head)
-    dataset = PairDataset(records, head, layout, size=CROP_PIXELS, seed=SEED, samples=count)
+    dataset = PairDataset(
+        records, head, layout, size=CROP_PIXELS, seed=SEED, samples=count, deform=deform
+    )
     batches = (dataset[index] for index in range(count))
     return layout, [{name: value.numpy() for name, value in b.items()} for b in batches]
 
@@ -105,26 +141,39 @@ def feature_range(network: Path, placed: Sequence[Placed]) -> float:
     return float(np.max(largest)) / 255
 
 
-def export(checkpoint: Path, output: Path, records: Path) -> dict[str, str]:
+def export(
+    checkpoint: Path, output: Path, records: Path, notes: Mapping[str, str]
+) -> dict[str, str]:
     """Write the model folder; returns the training record that ``model.json`` holds.
 
+    Args:
+        checkpoint: of a run of the open preset.
+        output: folder, made if needed.
+        records: what it was trained on: hash, calibration.
+        notes: for the training record, such as data and licence.
+
     Raises:
+        InputError: not such a checkpoint, or no records.
         AssetError: a network differs from torch, or its 8-bit version from it.
     """
-    output.mkdir(parents=True, exist_ok=True)
-    model, step = averaged_model(checkpoint)
+    state = read(checkpoint)
+    model = averaged_model(state)
+    deform = state.get("config", {}).get("deformation", True)
     training = {
-        "step": str(step),
+        "step": str(state["step"]),
+        "features": model.config.features,
+        "deformation": str(deform).lower(),
         "records_sha256": records_hash(records),
         "date": datetime.now(UTC).date().isoformat(),
-        "licence": "Apache-2.0",
-        "data": "generated people only: clips/train and stills/train",
+        **notes,
     }
+    with write_errors(output):
+        output.mkdir(parents=True, exist_ok=True)
     weights.save(model, output / WEIGHTS, {"preset": "open"} | training)
     # The networks are made of the weights as stored, in half precision.
     fingerprint = weights.load_into(model, output / WEIGHTS)
     model.eval().requires_grad_(False)
-    layout, calibration = samples(records, CALIBRATION + HELD_OUT)
+    layout, calibration = samples(records, CALIBRATION + HELD_OUT, deform=deform)
     largest = descriptor_range(model, calibration[:CALIBRATION])
     export_describe(model, largest, output / DESCRIBE)
     placed = frames(output / DESCRIBE, layout, calibration)
@@ -143,8 +192,11 @@ def main() -> None:
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("output", type=Path, help="model folder")
     parser.add_argument("records", type=Path, help="what it was trained on: hash, calibration")
+    for name in NOTES:
+        parser.add_argument(f"--{name}", metavar="TEXT", help="for the training record")
     a = parser.parse_args()
-    for name, value in export(a.checkpoint, a.output, a.records).items():
+    notes = {name: text for name in NOTES if (text := getattr(a, name)) is not None}
+    for name, value in export(a.checkpoint, a.output, a.records, notes).items():
         print(f"{name:20s} {value}")
     for path in sorted(a.output.iterdir()):
         path.chmod(0o644)

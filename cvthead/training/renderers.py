@@ -11,6 +11,7 @@ from cvthead.head.hierarchy import MeshHierarchy
 from cvthead.model.config import OPEN
 from cvthead.model.cvthead import CVTHead
 from cvthead.model.paper import PaperCVTHead
+from cvthead.model.paper_pixel_aligned import PixelAlignedCVTHead
 from cvthead.points import PointLayout
 from cvthead.training.config import TrainConfig
 from cvthead.training.dataset import VIEWS
@@ -33,7 +34,7 @@ class OpenRenderer(nn.Module):
         return self.model.paint(
             rearrange(batch["driven"], "b v p c -> (b v) p c"),
             repeat(descriptors, "b p c -> (b v) p c", v=VIEWS),
-            repeat(batch["seen"], "b p -> (b v) p", v=VIEWS),
+            rearrange(batch["seen"], "b v p -> (b v) p"),
             rearrange(batch["warped"], "b v ... -> (b v) ..."),
         )
 
@@ -45,7 +46,7 @@ class PaperRenderer(nn.Module):
     person on black, which is what the records' samples hold.
     """
 
-    def __init__(self, model: PaperCVTHead, vertices: int) -> None:
+    def __init__(self, model: PaperCVTHead | PixelAlignedCVTHead, vertices: int) -> None:
         super().__init__()
         self.model, self.vertices = model, vertices
 
@@ -61,5 +62,7 @@ def build_renderer(config: TrainConfig, layout: PointLayout) -> OpenRenderer | P
     """The network of a configuration, with random weights."""
     hierarchy = MeshHierarchy.load()
     if config.preset == "paper":
-        return PaperRenderer(PaperCVTHead(hierarchy), layout.vertices)
+        aligned = config.features == "pixel-aligned"
+        model = PixelAlignedCVTHead() if aligned else PaperCVTHead(hierarchy)
+        return PaperRenderer(model, layout.vertices)
     return OpenRenderer(CVTHead(replace(OPEN, features=config.features), hierarchy, layout))

@@ -68,6 +68,8 @@ def train(config: TrainConfig, *, sitting: int | None = None) -> Path:
         seed=config.seed + config.size,
         samples=config.steps * config.batch,
         deform=config.deformation,
+        labels=config.labels,
+        augment=config.augmentation,
     )
     objective = Objective(config).to(fabric.device)
     renderer = build_renderer(config, layout)

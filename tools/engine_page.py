@@ -1,0 +1,143 @@
+"""Served frames beside those of the float32 network, as a table and a page to look at::
+
+    python -m tools.engine_page out/engines PORTRAIT...
+
+The service paints with 8-bit integers; this shows what that changes. The float side is the trained
+network in PyTorch, from the same weights, splat and carried portrait.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from cvthead.avatar import Avatar
+from cvthead.controls import Controls, resolve
+from cvthead.deformation import MAX_SHELL_POINTS
+from cvthead.evaluation.page import Grid, write_page
+from cvthead.frame import Frame
+from cvthead.head.hierarchy import MeshHierarchy
+from cvthead.images import read_image
+from cvthead.model.config import OPEN
+from cvthead.model.cvthead import CVTHead
+from cvthead.pipeline import Pipeline
+from cvthead.points import FAR_AWAY
+from cvthead.runtime.model_folder import WEIGHTS, packaged
+from cvthead.runtime.threads import one_thread_per_call
+from cvthead.source import Source, as_network_input, cut_head, read_source
+from cvthead.weights import load_into
+
+Image = NDArray[np.uint8]
+
+WHITE = (255, 255, 255)
+MAGNIFIED = 8  # of the difference that the page shows
+POSES = {
+    "turned left, jaw open": Controls(global_rotation=(0, 0.5, 0), arkit={"jawOpen": 0.6}),
+    "as the portrait": Controls(),
+    "turned right, smiling": Controls(
+        global_rotation=(0, -0.5, 0), arkit={"mouthSmileLeft": 0.9, "mouthSmileRight": 0.9}
+    ),
+    "eyes shut": Controls(arkit={"eyeBlinkLeft": 1, "eyeBlinkRight": 1}),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class FloatNetwork:
+    """The open preset's networks in float32 PyTorch."""
+
+    model: CVTHead
+    pipeline: Pipeline
+
+    @classmethod
+    def load(cls, pipeline: Pipeline) -> FloatNetwork:
+        """From the packaged weights, which the pipeline's networks were made of."""
+        model = CVTHead(OPEN, MeshHierarchy.load(), pipeline.layout)
+        fingerprint = load_into(model, packaged("open") / WEIGHTS)
+        assert fingerprint == pipeline.fingerprint
+        return cls(model.eval().requires_grad_(False), pipeline)
+
+    def describe(self, source: Source) -> Tensor:
+        """(1, P, C) descriptors of all points of the layout."""
+        anchor = np.zeros(MAX_SHELL_POINTS, np.int64)
+        anchor[: len(source.deformation.shell_anchor)] = source.deformation.shell_anchor
+        visible = source.visible.astype(np.float32)
+        image, points, seen, anchors = (
+            torch.from_numpy(x)[None]
+            for x in (source.network_input, source.points, visible, anchor)
+        )
+        return self.model.describe(image, points, seen, anchors)
+
+    def paint(self, avatar: Avatar, source: Source, points: NDArray[np.float32]) -> Frame:
+        """The frame of driven points (P, 3), before any rounding but the last."""
+        layout = self.pipeline.layout
+        every = np.tile(FAR_AWAY, (layout.total, 1))
+        every[: len(points)] = points
+        placed = self.pipeline.place(avatar, points)
+        rgb, logits = self.model.paint(
+            torch.from_numpy(every)[None],
+            self.describe(source),
+            torch.from_numpy(source.places(layout)[None, :, 2]),
+            torch.from_numpy(as_network_input(placed.warped))[None],
+        )
+        colour = (rgb[0].permute(1, 2, 0) + 1) * 127.5
+        alpha = logits[0, 0].sigmoid() * 255
+        pixels, mask = (x.round().to(torch.uint8).numpy() for x in (colour, alpha))
+        # Beyond the points no network is asked.
+        return Frame(np.ascontiguousarray(pixels), np.minimum(mask, placed.reach))
+
+
+def psnr(a: Image, b: Image) -> float:
+    """dB between two pictures, at most 100."""
+    error = float(np.square(a.astype(np.float64) - b).mean())
+    return min(100.0, 10 * float(np.log10(255**2 / max(error, 1e-9))))
+
+
+def compare(network: FloatNetwork, portrait: Path) -> tuple[Grid, list[float]]:
+    """Rows of served, float32 and magnified difference for each pose; and their PSNR, dB."""
+    pipeline = network.pipeline
+    image = read_image(portrait)
+    avatar = pipeline.encode(image)
+    crop = cut_head(pipeline.tracker, image, pipeline.tracker.track(image))
+    source = read_source(pipeline.deformer, pipeline.layout, crop)
+    rows, distances = {}, []
+    for name, controls in POSES.items():
+        pose = resolve(avatar.coefficients, avatar.camera, controls, pipeline.arkit)
+        points = pipeline.pose(avatar, *pose)
+        served = pipeline.paint(avatar, points).over(WHITE)
+        exact = network.paint(avatar, source, points).over(WHITE)
+        distances.append(psnr(served, exact))
+        off = cv2.convertScaleAbs(cv2.absdiff(served, exact), alpha=MAGNIFIED)
+        rows[f"{name}: {distances[-1]:.1f} dB"] = (served, exact, off.astype(np.uint8))
+    titles = ("served (8-bit)", "float32", f"difference x {MAGNIFIED}")
+    return Grid(portrait.stem, titles, rows), distances
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(prog="python -m tools.engine_page", description=__doc__)
+    parser.add_argument("output", type=Path, help="folder of the page")
+    parser.add_argument("portraits", type=Path, nargs="+", help="pictures of faces")
+    args = parser.parse_args(argv)
+    one_thread_per_call()
+    network = FloatNetwork.load(Pipeline.load())
+    grids, lines = [], ["| portrait | median dB | lowest dB |", "| --- | ---: | ---: |"]
+    every: list[float] = []
+    for portrait in args.portraits:
+        grid, distances = compare(network, portrait)
+        grids.append(grid)
+        every += distances
+        lines.append(f"| {portrait.stem} | {np.median(distances):.1f} | {min(distances):.1f} |")
+    lines.append(f"| all | {np.median(every):.1f} | {min(every):.1f} |")
+    print("\n".join(lines))
+    print(f"\n{write_page(args.output, chr(10).join(lines), {'Portraits': grids})}")
+
+
+if __name__ == "__main__":
+    main()
