@@ -1,4 +1,7 @@
-"""Milliseconds of every stage, and what they are in the plain PyTorch float32 path of this run."""
+"""Milliseconds of every stage, and what they are in the plain PyTorch float32 path of this run.
+
+The open preset's stages; cvthead/official/benchmark.py has the official one's.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,13 +17,16 @@ from numpy.typing import NDArray
 from cvthead.avatar import Avatar
 from cvthead.controls import Controls, resolve
 from cvthead.driving import drive
+from cvthead.frame import Frame
 from cvthead.images import ImageFormat, decode_image, encode_image
 from cvthead.pipeline import Pipeline, without_person
+from cvthead.preset import AnyAvatar, Preset
 from cvthead.source import cut_head, read_source
 from cvthead.tracking.tracker import TrackedFace
 
 P = ParamSpec("P")
 T = TypeVar("T")
+AvatarT = TypeVar("AvatarT", bound=AnyAvatar)
 
 WARM_UP = 3
 ENCODES = 5
@@ -76,14 +82,19 @@ def time_render(pipeline: Pipeline, avatar: Avatar, count: int) -> dict[str, dic
         placed = watch.time("splat and warp", pipeline.place, avatar, points)
         watch.time("U-Net", networks.paint, [placed])
         frame = watch.time("all of render", pipeline.render, avatar, controls)
-        picture = watch.time("composite on colour", frame.over, (255, 255, 255))
-        for name in FORMATS:
-            watch.time(f"to {name}", encode_image, picture, name)
+        time_formats(watch, frame)
     return watch.summary(skipped=WARM_UP)
 
 
+def time_formats(watch: Stopwatch, frame: Frame) -> None:
+    """Stages from a frame to a picture file."""
+    picture = watch.time("composite on colour", frame.over, (255, 255, 255))
+    for name in FORMATS:
+        watch.time(f"to {name}", encode_image, picture, name)
+
+
 def time_drive(
-    pipeline: Pipeline, avatar: Avatar, image: NDArray[np.uint8], count: int
+    pipeline: Preset[AvatarT], avatar: AvatarT, image: NDArray[np.uint8], count: int
 ) -> dict[str, dict[str, float]]:
     """From a driving JPEG to a rendered JPEG, the face known from the frame before."""
     watch = Stopwatch()
@@ -101,7 +112,7 @@ def time_drive(
 
 
 def _track(
-    pipeline: Pipeline, image: NDArray[np.uint8], previous: TrackedFace | None
+    pipeline: Preset[Any], image: NDArray[np.uint8], previous: TrackedFace | None
 ) -> TrackedFace:
     shape = None if previous is None else previous.coefficients.shape
     return pipeline.tracker.track(image, shape=shape, previous=previous)

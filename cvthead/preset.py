@@ -27,11 +27,11 @@ from cvthead.camera import Camera, Crop
 from cvthead.coefficients import Array, Coefficients
 from cvthead.controls import Controls
 from cvthead.driving import Driven
-from cvthead.errors import AssetError
 from cvthead.frame import Frame
 from cvthead.head.arkit import ArkitMap
 from cvthead.head.model import HeadModel
 from cvthead.official.avatar import OfficialAvatar, is_official
+from cvthead.official.pipeline import OfficialPipeline
 from cvthead.pipeline import Pipeline
 from cvthead.tracking.networks import Networks
 from cvthead.tracking.tracker import TrackedFace
@@ -111,18 +111,10 @@ def load_preset(name: str, *, model: Path | None = None, threads: int | None = N
 
     Raises:
         AssetError: an unknown preset, or a missing or altered file; for "official": nothing was
-            imported, or PyTorch is not installed.
+            imported.
     """
     if name != "official":
         return Pipeline.load(name, model=model, threads=threads)
-    try:
-        # PyTorch takes seconds to load and is not installed everywhere.
-        from cvthead.official.pipeline import OfficialPipeline
-    except ImportError as error:
-        raise AssetError(
-            f"the official preset needs {error.name}",
-            hint='install with pip install "cvthead[train]"',
-        ) from error
     return OfficialPipeline.load(model, threads=threads)
 
 

@@ -24,6 +24,7 @@ from cvthead.official.avatar import OfficialAvatar
 from cvthead.official.crop import FaceSquare
 from cvthead.official.flame import PREFIX, from_checkpoint
 from cvthead.official.keys import released_shapes
+from cvthead.official.manifest import FILES, write_manifest
 
 Arrays = dict[str, NDArray[Any]]
 State = dict[str, Tensor]
@@ -139,6 +140,15 @@ def avatar() -> OfficialAvatar:
         rng.integers(0, 256, (256, 256, 3)).astype(np.uint8),
         "0123456789abcdef",
     )
+
+
+def earlier_import(folder: Path) -> Path:
+    """As the import writes it; what is in the files does not matter here."""
+    folder.mkdir(parents=True)
+    for name in FILES:
+        (folder / name).write_bytes(b"earlier")
+    write_manifest(folder, ())
+    return folder
 
 
 def write_whole(folder: Path, weights: State, mesh: dict[str, list[Any]]) -> None:

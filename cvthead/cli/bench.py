@@ -6,12 +6,19 @@ import argparse
 import json
 from typing import Any
 
-from cvthead.benchmark import time_drive, time_encode, time_render, time_torch
+import numpy as np
+from numpy.typing import NDArray
+
+from cvthead import benchmark
 from cvthead.cli.portrait import add_portrait_options
 from cvthead.errors import InputError
 from cvthead.images import read_image
+from cvthead.official import benchmark as official_benchmark
+from cvthead.official.pipeline import OfficialPipeline
 from cvthead.pipeline import Pipeline
 from cvthead.runtime.threads import cores
+
+Report = dict[str, Any]
 
 TITLES = {
     "encode": "Once per portrait",
@@ -45,20 +52,44 @@ def run(args: argparse.Namespace) -> None:
             raise InputError(f"--{name} is {value}", hint="use 1 or more")
     image = read_image(args.portrait)
     threads = args.threads or cores()
-    pipeline = Pipeline.load(args.preset, threads=threads)
-    avatar = pipeline.encode(image, face=args.face)
-    report: dict[str, Any] = {
-        "threads": threads,
-        "encode": time_encode(pipeline, image, args.face),
-        "render": time_render(pipeline, avatar, args.renders),
-        "drive": time_drive(pipeline, avatar, image, args.renders),
-    }
-    try:
-        report["torch"] = time_torch(threads)
-    except ImportError:
-        report["torch"] = None
+    times = time_official if args.preset == "official" else time_open
+    report = {"preset": args.preset, "threads": threads}
+    report |= times(image, args.face, args.renders, threads)
     report["ratios"] = ratios(report)
     print(json.dumps(report, indent=1) if args.json else table(report))
+
+
+def time_open(image: NDArray[np.uint8], face: int | None, renders: int, threads: int) -> Report:
+    """Stages of the open preset."""
+    pipeline = Pipeline.load(threads=threads)
+    avatar = pipeline.encode(image, face=face)
+    report: Report = {
+        "encode": benchmark.time_encode(pipeline, image, face),
+        "render": benchmark.time_render(pipeline, avatar, renders),
+        "drive": benchmark.time_drive(pipeline, avatar, image, renders),
+    }
+    try:
+        return report | {"torch": benchmark.time_torch(threads)}
+    except ImportError:
+        return report | {"torch": None}
+
+
+def time_official(image: NDArray[np.uint8], face: int | None, renders: int, threads: int) -> Report:
+    """Stages of the official preset, and the precision of its U-Net."""
+    pipeline = OfficialPipeline.load(threads=threads)
+    avatar = pipeline.encode(image, face=face)
+    report: Report = {
+        "precision": pipeline.networks.precision,
+        "encode": official_benchmark.time_encode(pipeline, image, face),
+        "render": official_benchmark.time_render(pipeline, avatar, renders),
+        "drive": benchmark.time_drive(pipeline, avatar, image, renders),
+    }
+    points = pipeline.pose(avatar, avatar.coefficients, avatar.camera)
+    folder = pipeline.networks.manifest.folder
+    try:
+        return report | {"torch": official_benchmark.time_torch(folder, avatar, points, threads)}
+    except ImportError:
+        return report | {"torch": None}
 
 
 def ratios(report: dict[str, Any]) -> dict[str, float]:
@@ -69,7 +100,8 @@ def ratios(report: dict[str, Any]) -> dict[str, float]:
 
 
 def table(report: dict[str, Any]) -> str:
-    lines = [f"{'threads':<24}{report['threads']:>9}"]
+    facts = ("preset", "precision", "threads")
+    lines = [f"{name:<24}{report[name]:>9}" for name in facts if name in report]
     for key, title in TITLES.items():
         if report[key] is None:
             lines += ["", f"{title}: not installed (pip install 'cvthead[train]')"]

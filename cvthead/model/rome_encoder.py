@@ -23,10 +23,14 @@ class StandardisedConv2d(nn.Conv2d):
     """
 
     def forward(self, x: Tensor) -> Tensor:
+        return F.conv2d(x, self.standardised(), self.bias, self.stride, self.padding)
+
+    def standardised(self) -> Tensor:
+        """The filters that :meth:`forward` applies."""
         centred = self.weight - self.weight.mean(dim=(1, 2, 3), keepdim=True)
         deviation = centred.std(dim=(1, 2, 3), keepdim=True, correction=1)
         weight: Tensor = centred / (deviation + 1e-5)
-        return F.conv2d(x, weight, self.bias, self.stride, self.padding)
+        return weight
 
 
 class Bottleneck(nn.Module):

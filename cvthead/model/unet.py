@@ -39,12 +39,12 @@ class Up(nn.Module):
 
 
 class UNet(nn.Module):
-    """(b, size_in, h, w) -> (b, 4, h, w): RGB and mask before tanh and sigmoid.
+    """(b, size_in, h, w) -> (b, size_out, h, w): RGB and mask before tanh and sigmoid.
 
     Height and width must be multiples of ``2 ** (len(sizes) - 1)``.
     """
 
-    def __init__(self, size_in: int, sizes: Sequence[int]) -> None:
+    def __init__(self, size_in: int, sizes: Sequence[int], size_out: int = 4) -> None:
         super().__init__()
         before = [size_in, *sizes[:-1]]
         self.downs = nn.ModuleList(
@@ -52,7 +52,7 @@ class UNet(nn.Module):
             for a, b in zip(before, sizes, strict=True)
         )
         self.ups = nn.ModuleList(Up(a, b) for a, b in pairwise(reversed(sizes)))
-        self.to_image = nn.Conv2d(sizes[0], 4, 1)
+        self.to_image = nn.Conv2d(sizes[0], size_out, 1)
 
     def forward(self, x: Tensor) -> Tensor:
         skips = []

@@ -22,6 +22,7 @@ from cvthead.model.bisenet import AUXILIARY_HEADS, FaceParsing
 from cvthead.model.official_keys import network_state
 from cvthead.model.paper import PaperCVTHead
 from cvthead.official import flame, torch_files
+from cvthead.official.export import export_networks
 from cvthead.official.keys import check, part, released_shapes
 from cvthead.official.manifest import (
     DECA,
@@ -30,6 +31,7 @@ from cvthead.official.manifest import (
     HAIR,
     MESH,
     NETWORK,
+    OPTIONAL_FILES,
     PARSING,
     RECORD,
     SourceFile,
@@ -37,8 +39,10 @@ from cvthead.official.manifest import (
     write_manifest,
 )
 from cvthead.official.mesh import read_hierarchy
+from cvthead.official.quantise import quantise_unet
 
 State = dict[str, Tensor]
+Files = Mapping[str, Mapping[str, Tensor]]
 CHECKPOINT = "cvthead.pt"
 TABLES = "transform.pkl"
 FLAME_NAMES = ("generic_model.pkl", "flame2023.pkl", "flame2023_Open.pkl")
@@ -153,7 +157,7 @@ def import_official(source: Path, output: Path, *, replace: bool = False) -> tup
     Args:
         source: folder with ``cvthead.pt``, ``transform.pkl`` and, for what the checkpoint does
             not hold, the separate files; they may lie in folders below it.
-        output: new folder for safetensors files and ``model.json``.
+        output: new folder for safetensors and ONNX files and ``model.json``.
         replace: an earlier import in ``output`` gives way once the new one is complete; until
             then, and if anything fails, it stays as it was.
 
@@ -164,24 +168,47 @@ def import_official(source: Path, output: Path, *, replace: bool = False) -> tup
         InputError: ``source`` is no folder, ``output`` cannot be written or is there already
             (with ``replace``: holds anything but an import).
         AssetError: a file is missing, damaged, holds more than data, or its keys and shapes are
-            not the released ones; lists them all.
+            not the released ones; lists them all. Or an ONNX file differs from PyTorch.
     """
     if not source.is_dir():
         raise InputError(f"{source} is not a folder", hint=PLACES)
     check_output(output, replace=replace)
+    files, sources = read_release(source)
+    # Resolved, for the folder that a link names is meant, not the link.
+    new = atomic_path(output.resolve(), folder=True, replace=replace)
+    with new as temporary, write_errors(output):
+        write_model(temporary, files, sources)
+        # It is calibrated on what the float networks paint.
+        write_manifest(temporary, sources, quantise_unet(temporary))
+    return sources
+
+
+def read_release(source: Path) -> tuple[Files, tuple[SourceFile, ...]]:
+    """Check the released files below ``source`` and convert them; writes nothing.
+
+    Returns:
+        File name -> tensors under the names of this package's modules, and the files used.
+
+    Raises:
+        AssetError: as :func:`import_official`.
+    """
     folder = _Folder(source)
     state = _complete_state(folder)
     tables = _flame(folder, state)
     hierarchy = read_hierarchy(folder.find((TABLES,), "mesh hierarchy"))
-    files = _converted(state, tables, hierarchy)
-    # Resolved, for the folder that a link names is meant, not the link.
-    new = atomic_path(output.resolve(), folder=True, replace=replace)
-    with new as temporary, write_errors(output):
-        for name, tensors in files.items():
-            save_file({key: value.contiguous() for key, value in tensors.items()}, temporary / name)
-        sources = folder.sources()
-        write_manifest(temporary, sources)
-    return sources
+    return _converted(state, tables, hierarchy), folder.sources()
+
+
+def write_model(folder: Path, files: Files, sources: tuple[SourceFile, ...]) -> None:
+    """Write weights, float32 networks and ``model.json`` into a folder that is there.
+
+    Raises:
+        AssetError: an ONNX file differs from PyTorch.
+    """
+    for name, tensors in files.items():
+        save_file({key: value.contiguous() for key, value in tensors.items()}, folder / name)
+    export_networks(folder)
+    write_manifest(folder, sources)
 
 
 def check_output(output: Path, *, replace: bool) -> None:
@@ -196,7 +223,7 @@ def check_output(output: Path, *, replace: bool) -> None:
         raise InputError(
             f"{output} is already there", hint="replace it with --replace, or choose another -o"
         )
-    if others := found - {*FILES, RECORD}:
+    if others := found - {*FILES, *OPTIONAL_FILES, RECORD}:
         raise InputError(
             f"{output} holds more than an import: {', '.join(sorted(others)[:5])}",
             hint="choose another folder with -o",
@@ -226,10 +253,7 @@ def _flame(folder: _Folder, state: State) -> flame.Flame:
     return flame.from_files(model, folder.find(LANDMARK_NAMES, "FLAME's landmarks"))
 
 
-def _converted(
-    state: State, tables: flame.Flame, hierarchy: MeshHierarchy
-) -> dict[str, Mapping[str, Tensor]]:
-    """File name -> tensors under the names of this package's modules."""
+def _converted(state: State, tables: flame.Flame, hierarchy: MeshHierarchy) -> Files:
     # Parameters without memory: only names and shapes are wanted.
     with torch.device("meta"):
         shapes = PaperCVTHead(hierarchy).state_dict()

@@ -7,10 +7,12 @@ from collections.abc import Mapping
 from functools import cache
 from importlib import resources
 from types import MappingProxyType
-
-from torch import Tensor
+from typing import TYPE_CHECKING
 
 from cvthead.errors import AssetError
+
+if TYPE_CHECKING:  # the import alone has tensors; serving goes without PyTorch
+    from torch import Tensor
 
 Shapes = Mapping[str, tuple[int, ...]]
 

@@ -1,4 +1,4 @@
-"""The imported model's folder: safetensors files and ``model.json``, which vouches for them."""
+"""The imported model's folder: weights, networks and ``model.json``, which vouches for them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cvthead.errors import AssetError
 from cvthead.files import write_file
 
 RECORD = "model.json"
-VERSION = 1
+VERSION = 2
 PRESET = "official"
 NETWORK = "cvthead.safetensors"
 PARSING = "face_parsing.safetensors"
@@ -23,7 +23,18 @@ HAIR = "hair.safetensors"
 DECA = "deca.safetensors"
 FLAME = "flame.safetensors"
 MESH = "mesh.safetensors"
-FILES = (NETWORK, PARSING, HAIR, DECA, FLAME, MESH)
+WEIGHTS = (NETWORK, PARSING, HAIR, DECA, FLAME, MESH)
+# The networks as they are served, made from the weights.
+PARSING_ONNX = "face_parsing.onnx"
+HAIR_ONNX = "hair.onnx"
+DECA_ONNX = "deca.onnx"
+DESCRIBE_ONNX = "describe.onnx"
+UNET_ONNX = "unet.onnx"
+UNET_INT8_ONNX = "unet_int8.onnx"
+NETWORKS = (PARSING_ONNX, HAIR_ONNX, DECA_ONNX, DESCRIBE_ONNX, UNET_ONNX)
+FILES = (*WEIGHTS, *NETWORKS)
+OPTIONAL_FILES = (UNET_INT8_ONNX,)
+MIN_UNET_PSNR = 40.0  # dB of the 8-bit U-Net to the float one; below it that one is served
 HINT = "import the official files again with `cvthead import-official`"
 FOLDER_VARIABLE = "CVTHEAD_OFFICIAL"
 WEIGHTS_PART = "CVTHead weights and tables (cvthead.pt, data/)"
@@ -85,13 +96,15 @@ class Manifest:
         folder: where it lies.
         fingerprint: 16 hex digits of all weights; avatars remember it.
         sources: the files it was made from.
-        sha256: of each safetensors file.
+        sha256: of each of FILES, and of those of OPTIONAL_FILES that are there.
+        unet_psnr: dB of the 8-bit U-Net to the float one; None before it was made.
     """
 
     folder: Path
     fingerprint: str
     sources: tuple[SourceFile, ...]
     sha256: Mapping[str, str]
+    unet_psnr: float | None
 
     @classmethod
     def load(cls, folder: Path) -> Manifest:
@@ -115,15 +128,22 @@ class Manifest:
                 for s in record["sources"]
             )
             sha256 = {name: str(record["sha256"][name]) for name in FILES}
+            sha256 |= {
+                name: str(record["sha256"][name])
+                for name in OPTIONAL_FILES
+                if name in record["sha256"]
+            }
+            stored = record["unet_psnr"]
+            unet_psnr = None if stored is None else float(stored)
             fingerprint = str(record["fingerprint"])
             if not re.fullmatch("[0-9a-f]{16}", fingerprint):
                 raise ValueError("no fingerprint")
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise AssetError(f"{path} is not an imported model: {error!r}", hint=HINT) from error
-        return cls(folder, fingerprint, sources, sha256)
+        return cls(folder, fingerprint, sources, sha256, unet_psnr)
 
     def checked(self, name: str) -> Path:
-        """Path of one of FILES, after comparing its hash.
+        """Path of a file of the import, after comparing its hash.
 
         Raises:
             AssetError: missing or altered.
@@ -138,16 +158,21 @@ class Manifest:
         return path
 
 
-def write_manifest(folder: Path, sources: tuple[SourceFile, ...]) -> None:
-    """Write ``model.json`` for the FILES in ``folder``."""
-    sha256 = {name: file_sha256(folder / name) for name in FILES}
-    digest = hashlib.sha256("".join(sha256[name] for name in FILES).encode())
+def write_manifest(
+    folder: Path, sources: tuple[SourceFile, ...], unet_psnr: float | None = None
+) -> None:
+    """Write ``model.json`` for the FILES and OPTIONAL_FILES in ``folder``."""
+    names = [*FILES, *(name for name in OPTIONAL_FILES if (folder / name).is_file())]
+    sha256 = {name: file_sha256(folder / name) for name in names}
+    # Of the weights alone: an avatar stays what it is when the networks are exported anew.
+    digest = hashlib.sha256("".join(sha256[name] for name in WEIGHTS).encode())
     record = {
         "preset": PRESET,
         "version": VERSION,
         "fingerprint": digest.hexdigest()[:16],
         "sources": [asdict(source) for source in sources],
         "licences": [asdict(licence) for licence in LICENCES],
+        "unet_psnr": unet_psnr,
         "sha256": sha256,
     }
     write_file(folder / RECORD, (json.dumps(record, indent=2) + "\n").encode())

@@ -1,97 +1,141 @@
-"""The imported networks, loaded for inference."""
+"""The imported networks on onnxruntime, and FLAME."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
-import torch
+import onnxruntime as ort
 from numpy.typing import NDArray
 from safetensors import SafetensorError
-from safetensors.numpy import load_file as load_arrays
-from safetensors.torch import load_file
-from torch import Tensor, nn
+from safetensors.numpy import load_file
 
 from cvthead.errors import AssetError
-from cvthead.head.hierarchy import MeshHierarchy
-from cvthead.model.bisenet import FaceParsing
-from cvthead.model.deca import DecaEncoder
-from cvthead.model.hair import LinearDeformation
-from cvthead.model.paper import PaperCVTHead
 from cvthead.official.flame import Flame
 from cvthead.official.manifest import (
-    DECA,
+    DECA_ONNX,
+    DESCRIBE_ONNX,
     FLAME,
-    HAIR,
+    HAIR_ONNX,
     HINT,
-    MESH,
-    NETWORK,
-    PARSING,
+    PARSING_ONNX,
+    UNET_INT8_ONNX,
+    UNET_ONNX,
     Manifest,
 )
+from cvthead.runtime.sessions import open_session
+from cvthead.runtime.threads import cores
+
+Precision = Literal["int8", "float32"]
+Array = NDArray[np.float32]
+
+# A portrait's pass takes hundreds of megabytes, which the frames after it do not need.
+GIVE_BACK = ("memory.enable_memory_arena_shrinkage", "cpu:0")
+
+
+@dataclass(frozen=True, eq=False)
+class Network:
+    """An opened ONNX file; safe to share between threads.
+
+    Attributes:
+        session: of onnxruntime.
+        keeps_memory: for the next pass; False gives it back after each.
+    """
+
+    session: ort.InferenceSession
+    keeps_memory: bool
+
+    def __call__(self, *inputs: Array) -> list[Array]:
+        """All outputs for a batch of one; the inputs in the file's order."""
+        names = (each.name for each in self.session.get_inputs())
+        options = ort.RunOptions()
+        if not self.keeps_memory:
+            options.add_run_config_entry(*GIVE_BACK)
+        feed = dict(zip(names, inputs, strict=True))
+        out: list[Array] = self.session.run(None, feed, options)
+        return out
+
+    @property
+    def channels(self) -> int:
+        """Of a channels-last input."""
+        return int(self.session.get_inputs()[0].shape[-1])
 
 
 @dataclass(frozen=True, eq=False)
 class OfficialNetworks:
-    """Everything with weights, in single precision and evaluation mode."""
+    """Everything with weights.
+
+    Attributes:
+        manifest: of the import.
+        flame: the head model's tables.
+        parsing: (1, 3, 256, 256) RGB in [-1, 1] -> (1, 19, 256, 256) logits.
+        hair: the same -> (1, 60) coefficients and (1, 5023, 3) offsets in metres.
+        deca: (1, 3, 224, 224) RGB in [0, 1] -> (1, 236) codes.
+        describe: (1, 4, 256, 256) RGB in [-1, 1] and mask, (1, 5023, 3) projections
+            -> (1, 5023, 32) descriptors.
+        unet: (1, 256, 256, channels) splat -> (1, 256, 256, 4) RGB before tanh, mask before
+            sigmoid.
+        precision: of the U-Net; everything else is float32.
+    """
 
     manifest: Manifest
     flame: Flame
-    network: PaperCVTHead
-    parsing: FaceParsing
-    hair: LinearDeformation
-    deca: DecaEncoder
+    parsing: Network
+    hair: Network
+    deca: Network
+    describe: Network
+    unet: Network
+    precision: Precision
 
     @classmethod
-    def load(cls, folder: Path) -> OfficialNetworks:
+    def load(
+        cls, folder: Path, *, precision: Precision = "int8", threads: int | None = None
+    ) -> OfficialNetworks:
         """Load an imported model.
+
+        Args:
+            folder: of the import.
+            precision: wanted of the U-Net; an import whose 8-bit U-Net was not close enough to
+                the float one has the float one alone.
+            threads: of each network; None takes the machine's cores.
 
         Raises:
             AssetError: nothing was imported there, or a file is missing, altered or does not fit.
         """
         manifest = Manifest.load(folder)
+        if UNET_INT8_ONNX not in manifest.sha256:
+            precision = "float32"
+        unet = UNET_INT8_ONNX if precision == "int8" else UNET_ONNX
         try:
-            tables = Flame(**load_arrays(manifest.checked(FLAME)))
-            hierarchy = _hierarchy(load_arrays(manifest.checked(MESH)))
-            network = PaperCVTHead(hierarchy)
-            parsing = FaceParsing()
-            hair = LinearDeformation(len(tables.template))
-            deca = DecaEncoder()
-            _fill(network, manifest.checked(NETWORK))
-            _fill(parsing, manifest.checked(PARSING))
-            _fill(hair, manifest.checked(HAIR))
-            _fill(deca, manifest.checked(DECA))
-        except (SafetensorError, RuntimeError, TypeError, KeyError) as error:
-            raise AssetError(
-                f"{folder} does not fit this version: {str(error).splitlines()[0]}", hint=HINT
-            ) from error
-        return cls(manifest, tables, network, parsing, hair, deca)
+            flame = Flame(**load_file(manifest.checked(FLAME)))
+        except (SafetensorError, TypeError) as error:
+            raise AssetError(f"{folder} does not fit this version: {error}", hint=HINT) from error
+        count = threads or cores()
+
+        def opened(name: str, *, keeps_memory: bool = False) -> Network:
+            session = open_session(str(manifest.checked(name)), count)
+            return Network(session, keeps_memory)
+
+        return cls(
+            manifest,
+            flame,
+            opened(PARSING_ONNX),
+            opened(HAIR_ONNX),
+            opened(DECA_ONNX, keeps_memory=True),
+            opened(DESCRIBE_ONNX),
+            opened(unet, keeps_memory=True),
+            precision,
+        )
 
 
-def _fill(module: nn.Module, path: Path) -> None:
-    state: dict[str, Tensor] = load_file(path)
-    # Takes the file's memory over instead of copying it.
-    module.load_state_dict(state, assign=True)
-    module.eval().requires_grad_(False)
-
-
-def _hierarchy(arrays: dict[str, NDArray[np.generic]]) -> MeshHierarchy:
-    levels = range(2)
-    return MeshHierarchy(
-        tuple(arrays[f"down_{k}"].astype(np.int32) for k in levels),
-        tuple(
-            (
-                arrays[f"up_indices_{k}"].astype(np.int32),
-                arrays[f"up_weights_{k}"].astype(np.float32),
-            )
-            for k in levels
-        ),
-        tuple(arrays[f"spirals_{k}"].astype(np.int32) for k in levels),
-    )
-
-
-def picture_tensor(picture: NDArray[np.uint8]) -> Tensor:
+def picture_array(picture: NDArray[np.uint8]) -> Array:
     """(h, w, 3) uint8 RGB -> (1, 3, h, w) in [-1, 1], as the released code normalises."""
-    image = torch.from_numpy(np.ascontiguousarray(picture)).permute(2, 0, 1)[None]
-    return (image / 255 - 0.5) / 0.5
+    scaled = picture.transpose(2, 0, 1)[None].astype(np.float32) / np.float32(255)
+    return np.ascontiguousarray((scaled - np.float32(0.5)) / np.float32(0.5))
+
+
+def foreground(logits: Array) -> Array:
+    """(b, 19, h, w) of the parsing -> (b, 1, h, w) of 0 and 1: any class but background."""
+    return np.asarray(logits[:, 1:].max(axis=1, keepdims=True) > logits[:, :1], np.float32)

@@ -13,9 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from cvthead.camera import CROP_PIXELS, Camera
 from cvthead.coefficients import Coefficients
@@ -24,13 +22,14 @@ from cvthead.errors import ModelChangedError
 from cvthead.frame import Frame
 from cvthead.head.arkit import ArkitMap
 from cvthead.head.model import HeadModel
-from cvthead.model.paper import over_white
 from cvthead.official.arkit import fit_arkit
 from cvthead.official.avatar import OfficialAvatar
 from cvthead.official.background import without_person
 from cvthead.official.crop import FaceSquare
 from cvthead.official.manifest import PRESET, default_folder
-from cvthead.official.networks import OfficialNetworks, picture_tensor
+from cvthead.official.networks import OfficialNetworks, Precision, foreground, picture_array
+from cvthead.official.painted import Painted
+from cvthead.official.splat import splat
 from cvthead.official.tracker import OfficialTracker, Picture
 from cvthead.tracking.tracker import TrackedFace, Tracker
 
@@ -63,19 +62,26 @@ class OfficialPipeline:
     tracker: OfficialTracker
 
     @classmethod
-    def load(cls, folder: Path | None = None, *, threads: int | None = None) -> OfficialPipeline:
+    def load(
+        cls,
+        folder: Path | None = None,
+        *,
+        precision: Precision = "int8",
+        threads: int | None = None,
+    ) -> OfficialPipeline:
         """Load an imported model.
 
         Args:
             folder: of the import; None takes :func:`default_folder`.
-            threads: of PyTorch, in the whole process; None leaves it as it is.
+            precision: of the U-Net: "int8", where the import found it close enough to float, or
+                "float32".
+            threads: of each network; None takes the machine's cores.
 
         Raises:
             AssetError: nothing was imported there, or it is damaged.
         """
-        if threads is not None:
-            torch.set_num_threads(threads)
-        networks = OfficialNetworks.load(folder or default_folder())
+        folder = folder or default_folder()
+        networks = OfficialNetworks.load(folder, precision=precision, threads=threads)
         finder, flame = Tracker.load(), networks.flame
         head = flame.head()
         arkit = fit_arkit(flame, finder.head, ArkitMap.load())
@@ -115,7 +121,6 @@ class OfficialPipeline:
         picture = self.tracker.picture(image, face=face, only_one=only_one)
         return self.encode_picture(picture, deform=deform)
 
-    @torch.inference_mode()
     def encode_picture(self, picture: Picture, *, deform: bool = True) -> OfficialAvatar:
         """Turn a 256 x 256 picture into an avatar, as the released code does.
 
@@ -123,26 +128,44 @@ class OfficialPipeline:
             picture: with the whole head in view.
             deform: False leaves out hair and shoulders.
         """
-        networks = self.networks
-        image = picture_tensor(picture.pixels)
-        mask = networks.parsing.mask(image)
-        square = picture.square
+        image, square = picture_array(picture.pixels), picture.square
+        mask = self.mask(image)
         estimate = self.tracker.estimate(picture.pixels, square)
-        offsets = networks.hair(image)[0].numpy() if deform else np.zeros_like(self.head.template)
+        offsets = self.offsets(image) if deform else np.zeros_like(self.head.template)
         camera = square.camera(estimate.cam)
         points = self._project(estimate.coefficients, camera, offsets, square)
-        source = torch.cat([image, mask], dim=1)
-        descriptors = networks.network.describe(source, torch.from_numpy(points)[None])
         return OfficialAvatar(
-            descriptors[0].numpy(),
+            self.describe(image, mask, points),
             offsets,
             estimate.coefficients,
             camera,
             square,
             picture.crop,
-            without_person(picture.pixels, mask[0, 0].numpy() > 0),
+            without_person(picture.pixels, mask[0, 0] > 0),
             self.fingerprint,
         )
+
+    def mask(self, image: Array) -> Array:
+        """(1, 3, 256, 256) RGB in [-1, 1] -> (1, 1, 256, 256), 1 where the person is."""
+        (logits,) = self.networks.parsing(image)
+        return foreground(logits)
+
+    def offsets(self, image: Array) -> Array:
+        """(1, 3, 256, 256) RGB in [-1, 1] -> (5023, 3) hair and shoulders in metres."""
+        _, offsets = self.networks.hair(image)
+        return np.asarray(offsets[0])
+
+    def describe(self, image: Array, mask: Array, points: Array) -> Array:
+        """(5023, 32) vertex descriptors (paper section 3.3).
+
+        Args:
+            image: (1, 3, 256, 256) RGB in [-1, 1].
+            mask: (1, 1, 256, 256).
+            points: (5023, 3) the portrait's own projections.
+        """
+        source = np.concatenate([image, mask], axis=1)
+        (descriptors,) = self.networks.describe(source, points[None])
+        return np.asarray(descriptors[0])
 
     def drive(
         self,
@@ -216,7 +239,7 @@ class OfficialPipeline:
         Raises:
             ModelChangedError: as :meth:`render`.
         """
-        return self._frame(avatar, self.pose(avatar, coefficients, camera, square))
+        return self.paint(avatar, self.pose(avatar, coefficients, camera, square)).frame()
 
     def paint_many(self, frames: Sequence[tuple[OfficialAvatar, Array]]) -> list[Frame]:
         """Splat and U-Net of avatars with the points of :meth:`pose`.
@@ -224,13 +247,7 @@ class OfficialPipeline:
         One after the other: a batch is not faster on a CPU, and a picture must not depend on
         what is rendered beside it.
         """
-        return [self._frame(avatar, points) for avatar, points in frames]
-
-    def _frame(self, avatar: OfficialAvatar, points: Array) -> Frame:
-        rgb, logits = self.paint(avatar, points)
-        painted = torch.cat([0.5 * (rgb + 1), torch.sigmoid(logits)], dim=1)
-        pixels = (painted * 255).round().to(torch.uint8)[0].permute(1, 2, 0).numpy()
-        return Frame(np.ascontiguousarray(pixels[..., :3]), np.ascontiguousarray(pixels[..., 3]))
+        return [self.paint(avatar, points).frame() for avatar, points in frames]
 
     def white(
         self,
@@ -247,8 +264,8 @@ class OfficialPipeline:
             avatar, coefficients, camera, square: as :meth:`render_coefficients`.
             threshold: None blends by the mask; HARD_MASK cuts it as the released evaluation does.
         """
-        rgb, logits = self.paint(avatar, self.pose(avatar, coefficients, camera, square))
-        return over_white(rgb, logits, threshold)[0].numpy()
+        painted = self.paint(avatar, self.pose(avatar, coefficients, camera, square))
+        return painted.over_white(threshold)
 
     def pose(
         self,
@@ -270,11 +287,15 @@ class OfficialPipeline:
             )
         return self._project(coefficients, camera, avatar.offsets, square or avatar.square)
 
-    @torch.inference_mode()
-    def paint(self, avatar: OfficialAvatar, points: Array) -> tuple[Tensor, Tensor]:
-        """Splat and U-Net: RGB (1, 3, 256, 256) in [-1, 1] and mask logits (1, 1, 256, 256)."""
-        descriptors = torch.from_numpy(avatar.descriptors)[None]
-        return self.networks.network.paint(torch.from_numpy(points)[None], descriptors, CROP_PIXELS)
+    def paint(self, avatar: OfficialAvatar, points: Array) -> Painted:
+        """Splat and U-Net (paper section 3.4) of the points of :meth:`pose`."""
+        (raw,) = self.networks.unet(self.splat(avatar, points))
+        return Painted(raw[0])
+
+    def splat(self, avatar: OfficialAvatar, points: Array) -> Array:
+        """(1, 256, 256, channels) what the U-Net reads."""
+        channels = self.networks.unet.channels
+        return splat(points, avatar.descriptors, CROP_PIXELS, channels)[None]
 
     def background(self, avatar: OfficialAvatar) -> Image:
         """(256, 256, 3) uint8 RGB: the portrait's crop with the person painted away."""

@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from cvthead.camera import CROP_PIXELS, Camera, Crop
 from cvthead.coefficients import Array, Coefficients
 from cvthead.crop import head_crop
 from cvthead.head.model import HeadModel
-from cvthead.model.deca import DecaEncoder, split_codes
 from cvthead.official.crop import FaceSquare
+from cvthead.official.networks import Network
+from cvthead.runtime.deca_codes import split_codes
 from cvthead.tracking.landmarks68 import landmarks68
 from cvthead.tracking.networks import Networks
 from cvthead.tracking.tracker import TrackedFace, Tracker
@@ -67,13 +67,13 @@ class OfficialTracker:
     Attributes:
         head: FLAME.
         finder: finds faces and landmarks.
-        deca: DECA's encoder.
+        deca: DECA's encoder, see OfficialNetworks.
         rest_pose: (15,) axis-angle of the joints that DECA does not estimate.
     """
 
     head: HeadModel
     finder: Tracker
-    deca: DecaEncoder
+    deca: Network
     rest_pose: Array
 
     @property
@@ -122,11 +122,10 @@ class OfficialTracker:
         # The finder counts the first pixel's centre as 0.5, the released code as 0.
         return Picture(pixels, landmarks * (CROP_PIXELS / crop.size) - 0.5, crop)
 
-    @torch.inference_mode()
     def estimate(self, pixels: Image, square: FaceSquare) -> Estimate:
         """One DECA pass over ``square`` of a 256 x 256 picture."""
-        crop = torch.from_numpy(square.cut(pixels))[None]
-        codes = {name: value.numpy() for name, value in split_codes(self.deca(crop)[0]).items()}
+        (found,) = self.deca(square.cut(pixels)[None])
+        codes = split_codes(found[0])
         pose = self.full_pose(codes["pose"])
         return Estimate(Coefficients(codes["shape"], codes["exp"], pose), codes["cam"])
 

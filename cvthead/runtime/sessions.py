@@ -5,11 +5,11 @@ from __future__ import annotations
 import onnxruntime as ort
 
 
-def open_session(network: bytes, threads: int) -> ort.InferenceSession:
+def open_session(network: bytes | str, threads: int) -> ort.InferenceSession:
     """A network on the CPU.
 
     Args:
-        network: contents of an ONNX file.
+        network: contents of an ONNX file, or its path.
         threads: intra-operator threads, at least 1.
     """
     options = ort.SessionOptions()

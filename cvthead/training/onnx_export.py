@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import copy
 import itertools
-import warnings
-from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import onnx
-import onnxruntime as ort
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
@@ -21,14 +17,13 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from cvthead.camera import CROP_PIXELS
 from cvthead.deformation import MAX_SHELL_POINTS
-from cvthead.errors import AssetError
 from cvthead.model.cvthead import CVTHead
 from cvthead.model.light_unet import PIXEL_SIZE, PORTRAIT_SIZE
 from cvthead.runtime.fill import FILL_LEVELS, ZERO
 from cvthead.runtime.mix import LOGIT_RANGE
 from cvthead.runtime.place import CODE_STEPS, DEPTH_RANGE, code_size
+from cvthead.training.onnx_files import check_graph, compare, export_graph
 
-OPSET = 18
 MAX_BATCH = 64
 HALVED_FROM = 1024  # values
 # Largest difference to torch: descriptors in codes, pictures in a share of black to white.
@@ -169,11 +164,11 @@ def export_describe(model: CVTHead, largest: Tensor, path: Path) -> None:
         "visible": (torch.rand(1, points, generator=generator) > 0.5).float(),
         "anchor": torch.randint(0, 1000, (1, MAX_SHELL_POINTS), generator=generator),
     }
-    _export(DescribeGraph(folded(model), largest), inputs, path)
+    export_graph(DescribeGraph(folded(model), largest), inputs, path)
     with torch.inference_mode():
         expected = DescribeGraph(model.eval(), largest)(*inputs.values())
     _halve(path)
-    _check(path, inputs, expected, DESCRIBE_TOLERANCE)
+    check_graph(path, inputs, [expected], [DESCRIBE_TOLERANCE])
 
 
 def export_paint(model: CVTHead, largest: Tensor, feature_range: float, path: Path) -> None:
@@ -192,13 +187,13 @@ def export_paint(model: CVTHead, largest: Tensor, feature_range: float, path: Pa
     }
     graph = PaintGraph(folded(model), largest, feature_range)
     batch = torch.export.Dim("batch", min=1, max=MAX_BATCH)
-    _export(graph, inputs, path, {name: {0: batch} for name in inputs})
+    export_graph(graph, inputs, path, dynamic={name: {0: batch} for name in inputs})
     with torch.inference_mode():
         found = graph(*inputs.values())
         expected = _reference(model.eval(), largest, **inputs)
     hint = "its folded first and last convolutions no longer fit the model"
-    _compare("the frame graph", found.numpy(), expected, PAINT_TOLERANCE, hint)
-    _check(path, inputs, found, PAINT_TOLERANCE)
+    compare("the frame graph", found.numpy(), expected, PAINT_TOLERANCE, hint)
+    check_graph(path, inputs, [found], [PAINT_TOLERANCE])
 
 
 def _reference(model: CVTHead, largest: Tensor, splat: Tensor, portrait: Tensor) -> Tensor:
@@ -220,28 +215,6 @@ def _reference(model: CVTHead, largest: Tensor, splat: Tensor, portrait: Tensor)
     return torch.cat([rgba, gate], dim=-1)
 
 
-def _export(
-    graph: nn.Module,
-    inputs: Mapping[str, Tensor],
-    path: Path,
-    dynamic: dict[str, Any] | None = None,
-) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        torch.onnx.export(
-            graph.eval(),
-            tuple(inputs.values()),
-            path,
-            input_names=list(inputs),
-            output_names=["out"],
-            opset_version=OPSET,
-            dynamic_shapes=dynamic,
-            dynamo=True,
-            external_data=False,
-            verbose=False,
-        )
-
-
 def _halve(path: Path) -> None:
     """Store large tables in half precision; onnxruntime widens them once when it loads."""
     network = onnx.load(str(path))
@@ -256,19 +229,3 @@ def _halve(path: Path) -> None:
             cast = onnx.helper.make_node("Cast", [name], [table.name], to=onnx.TensorProto.FLOAT)
             network.graph.node.insert(0, cast)
     onnx.save(network, str(path))
-
-
-def _check(path: Path, inputs: Mapping[str, Tensor], expected: Tensor, tolerance: float) -> None:
-    session = ort.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    feed = {name: value.numpy() for name, value in inputs.items()}
-    found: NDArray[np.float32] = session.run(None, feed)[0]
-    hint = "look for an operator that the exporter translates differently"
-    _compare(path.name, found, expected, tolerance, hint)
-
-
-def _compare(name: str, found: NDArray[Any], expected: Tensor, tolerance: float, hint: str) -> None:
-    difference = float(np.abs(found.astype(np.float32) - expected.float().numpy()).max())
-    if difference > tolerance:
-        raise AssetError(
-            f"{name} differs from torch by {difference:g}, allowed {tolerance:g}", hint=hint
-        )

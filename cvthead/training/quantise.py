@@ -1,38 +1,31 @@
-"""Static 8-bit quantisation of the frame network, calibrated on real splats."""
+"""The open preset's frame network in 8 bits, calibrated on real splats."""
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import onnx
 import onnxruntime as ort
-from numpy.typing import NDArray
-from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
-from onnxruntime.quantization.shape_inference import quant_pre_process
 
 from cvthead.errors import AssetError
 from cvthead.runtime.mix import mix
 from cvthead.runtime.place import Placed
 from cvthead.runtime.subpixels import unshuffled
 from cvthead.training.onnx_export import to_codes
-
-Feed = dict[str, NDArray[np.float32]]
-Override = dict[str, Any]
+from cvthead.training.static_int8 import (
+    Feed,
+    Overrides,
+    concatenated,
+    largest,
+    override,
+    psnr,
+    quantise_network,
+)
 
 MIN_PSNR = 40.0
-QUANTISED = ("Conv", "Relu", "MaxPool", "Resize", "Concat", "Transpose")
-
-
-class _Feeds(CalibrationDataReader):  # type: ignore[misc]
-    def __init__(self, feeds: Sequence[Feed]) -> None:
-        self._rest: Iterator[Feed] = iter(feeds)
-
-    def get_next(self) -> Feed | None:
-        return next(self._rest, None)
 
 
 def feed(placed: Placed) -> Feed:
@@ -59,21 +52,8 @@ def quantise(
         AssetError: it is below 40 dB.
     """
     feeds = [feed(placed) for placed in calibration]
-    with tempfile.TemporaryDirectory() as folder:
-        prepared, simulated = Path(folder) / "prepared.onnx", Path(folder) / "simulated.onnx"
-        quant_pre_process(str(source), str(prepared), skip_symbolic_shape=True)
-        quantize_static(
-            str(prepared),
-            str(simulated),
-            _Feeds(feeds),
-            op_types_to_quantize=list(QUANTISED),
-            quant_format=QuantFormat.QDQ,
-            per_channel=True,
-            activation_type=QuantType.QUInt8,
-            weight_type=QuantType.QInt8,
-            extra_options={"TensorQuantOverrides": _overrides(onnx.load(str(prepared)), feeds)},
-        )
-        onnx.save(_on_bytes(onnx.load(str(simulated))), str(output))
+    network = quantise_network(source, feeds, partial(_overrides, feeds=feeds))
+    onnx.save(_on_bytes(network), str(output))
     exact, small = (
         ort.InferenceSession(str(path), providers=["CPUExecutionProvider"])
         for path in (source, output)
@@ -84,7 +64,7 @@ def quantise(
         expected = to_codes(exact.run(None, codes)[0])
         found = small.run(None, {name: x.astype(np.uint8) for name, x in codes.items()})[0]
         pictures = [mix(x[0], placed.warped, placed.reach) for x in (expected, found)]
-        lowest = min(lowest, _psnr(*pictures))
+        lowest = min(lowest, psnr(*pictures))
     if lowest < MIN_PSNR:
         raise AssetError(
             f"the 8-bit network is {lowest:.1f} dB from the float one, wanted {MIN_PSNR:g}",
@@ -93,27 +73,18 @@ def quantise(
     return float(lowest)
 
 
-def _overrides(network: onnx.ModelProto, feeds: Sequence[Feed]) -> dict[str, list[Override]]:
+def _overrides(network: onnx.ModelProto, feeds: Sequence[Feed]) -> Overrides:
     """Scales that calibration must not choose: bytes stay bytes at the network's ends, and what
-    is concatenated shares a scale, so that concatenating moves bytes and computes nothing."""
-    codes = _override(1.0, 0)
+    is concatenated shares a scale."""
+    codes = override(1.0, 0)
     overrides = dict.fromkeys(feeds[0], codes)
-    overrides[network.graph.output[0].name] = _override(1 / 127.5, 128)
+    overrides[network.graph.output[0].name] = override(1 / 127.5, 128)
     made_by = {name: node for node in network.graph.node for name in node.output}
-    groups: list[list[str]] = []
-    for node in network.graph.node:
-        if node.op_type == "Concat":
-            inputs = [made_by[name] for name in node.input if name in made_by]
-            # An upsampled tensor takes its scale from what it is made of.
-            groups.append(
-                [i.input[0] if i.op_type == "Resize" else i.output[0] for i in inputs]
-                + [i.output[0] for i in inputs]
-                + list(node.output)
-            )
-    largest = _largest(network, sorted({name for group in groups for name in group}), feeds)
+    groups = concatenated(network)
+    highest = largest(network, sorted({name for group in groups for name in group}), feeds)
     for group in groups:
         at_ends = any(made_by[name].op_type == "Transpose" for name in group)
-        shared = codes if at_ends else _override(max(largest[n] for n in group) / 255, 0)
+        shared = codes if at_ends else override(max(highest[n] for n in group) / 255, 0)
         overrides |= dict.fromkeys(group, shared)
     for node in network.graph.node:
         if node.op_type == "Transpose":
@@ -121,23 +92,6 @@ def _overrides(network: onnx.ModelProto, feeds: Sequence[Feed]) -> dict[str, lis
                 if a in overrides:
                     overrides[b] = overrides[a]
     return overrides
-
-
-def _override(scale: float, zero_point: int) -> list[Override]:
-    return [{"scale": np.array(scale, np.float32), "zero_point": np.array(zero_point, np.uint8)}]
-
-
-def _largest(
-    network: onnx.ModelProto, names: Sequence[str], feeds: Sequence[Feed]
-) -> dict[str, float]:
-    """Largest value of each tensor over the feeds; they follow a ReLU, so 0 is the smallest."""
-    probe = onnx.ModelProto()
-    probe.CopyFrom(network)
-    known = {output.name for output in probe.graph.output}
-    probe.graph.output.extend(onnx.ValueInfoProto(name=n) for n in names if n not in known)
-    session = ort.InferenceSession(probe.SerializeToString(), providers=["CPUExecutionProvider"])
-    found = [[float(x.max()) for x in session.run(list(names), each)] for each in feeds]
-    return dict(zip(names, np.max(found, axis=0).tolist(), strict=True))
 
 
 def _on_bytes(network: onnx.ModelProto) -> onnx.ModelProto:
@@ -160,10 +114,3 @@ def _on_bytes(network: onnx.ModelProto) -> onnx.ModelProto:
     graph.node.remove(last)
     output.type.tensor_type.elem_type = onnx.TensorProto.UINT8
     return network
-
-
-def _psnr(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:
-    """Of the pictures on black, so that colour where there is no head does not count."""
-    shown = [x[..., :3].astype(np.float64) * x[..., 3:] / 255 for x in (a, b)]
-    error = float(np.mean((shown[0] - shown[1]) ** 2))
-    return float(10 * np.log10(255**2 / max(error, 1e-10)))

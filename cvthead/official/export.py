@@ -1,0 +1,170 @@
+"""The imported weights become the ONNX files that serve them.
+
+Normalisations that do not depend on the picture are folded into the convolutions: batch norm of
+the U-Net, weight standardisation of the image encoder. Every file is compared with PyTorch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+from torch.nn.utils.fusion import fuse_conv_bn_eval
+
+from cvthead.camera import CROP_PIXELS
+from cvthead.model.hair import LinearDeformation
+from cvthead.model.paper import PaperCVTHead
+from cvthead.model.rome_encoder import StandardisedConv2d
+from cvthead.model.unet import ConvNorm, UNet
+from cvthead.official.crop import DECA_PIXELS
+from cvthead.official.manifest import (
+    DECA_ONNX,
+    DESCRIBE_ONNX,
+    HAIR_ONNX,
+    PARSING_ONNX,
+    UNET_ONNX,
+)
+from cvthead.official.torch_networks import TorchNetworks
+from cvthead.training.onnx_files import check_graph, export_graph
+
+TOLERANCE = 1e-3  # of an output's standard deviation
+SMALLEST = 1e-6  # difference that is let pass where an output is constant
+# onnxruntime's 8-bit convolution is slow over channels that are no multiple of this.
+CHANNEL_STEP = 4
+
+
+class HairGraph(nn.Module):
+    """(b, 3, 256, 256) RGB in [-1, 1] -> (b, 60) coefficients and (b, 5023, 3) offsets."""
+
+    def __init__(self, hair: LinearDeformation) -> None:
+        super().__init__()
+        self.hair = hair
+
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        coefficients = self.hair.hair_model.classify(image)
+        return coefficients, self.hair.offsets(coefficients)
+
+
+class DescribeGraph(nn.Module):
+    """PaperCVTHead.describe with standardised filters."""
+
+    def __init__(self, network: PaperCVTHead) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, source: Tensor, points: Tensor) -> Tensor:
+        return self.network.describe(source, points)
+
+
+class UNetGraph(nn.Module):
+    """(b, h, w, channels) splat -> (b, h, w, 4), RGB and mask before tanh and sigmoid.
+
+    Channels last, as the splat gathers them. The last convolution, of one pixel, is a linear
+    layer, so that the 8-bit network has its output in float without reordering its input.
+    """
+
+    def __init__(self, unet: UNet) -> None:
+        """Takes the U-Net over: batch norms are folded, its input gets CHANNEL_STEP's multiple of
+        channels, of which the last count for nothing."""
+        super().__init__()
+        last = unet.to_image
+        self.to_raw = nn.Linear(last.in_channels, last.out_channels)
+        self.to_raw.weight = nn.Parameter(last.weight[:, :, 0, 0])
+        self.to_raw.bias = last.bias  # type: ignore[assignment]
+        unet.to_image = nn.Identity()  # type: ignore[assignment]
+        _fold(unet)
+        _pad(unet)
+        self.unet = unet
+
+    def forward(self, splat: Tensor) -> Tensor:
+        features: Tensor = self.unet(splat.permute(0, 3, 1, 2))
+        raw: Tensor = self.to_raw(features.permute(0, 2, 3, 1))
+        return raw
+
+
+def export_networks(folder: Path) -> None:
+    """Write the float32 networks beside the safetensors files of ``folder``.
+
+    Raises:
+        AssetError: a file differs from PyTorch.
+    """
+    torch_networks = TorchNetworks.load(folder)
+    generator = torch.Generator().manual_seed(0)
+
+    def noise(*shape: int) -> Tensor:
+        return torch.rand(shape, generator=generator) * 2 - 1
+
+    network, hair = torch_networks.network, torch_networks.hair
+    picture = noise(1, 3, CROP_PIXELS, CROP_PIXELS)
+    _export(folder / PARSING_ONNX, torch_networks.parsing, {"image": picture}, ["logits"])
+    _export(folder / HAIR_ONNX, HairGraph(hair), {"image": picture}, ["coefficients", "offsets"])
+    face = noise(1, 3, DECA_PIXELS, DECA_PIXELS) / 2 + 0.5
+    _export(folder / DECA_ONNX, torch_networks.deca, {"face": face}, ["codes"])
+
+    source = torch.cat([picture, (noise(1, 1, CROP_PIXELS, CROP_PIXELS) > 0).float()], dim=1)
+    inputs = {"source": source, "points": noise(1, len(hair.deform_mean), 3)}
+    with torch.inference_mode():
+        expected = DescribeGraph(network)(**inputs)
+    _standardise(network)
+    _export(folder / DESCRIBE_ONNX, DescribeGraph(network), inputs, ["descriptors"], [expected])
+
+    channels = 1 + network.config.descriptor_size
+    splat = noise(1, CROP_PIXELS, CROP_PIXELS, channels)
+    with torch.inference_mode():
+        expected = network.unet(splat.permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
+    inputs = {"splat": F.pad(splat, (0, -channels % CHANNEL_STEP))}
+    _export(folder / UNET_ONNX, UNetGraph(network.unet), inputs, ["raw"], [expected])
+
+
+def _export(
+    path: Path,
+    graph: nn.Module,
+    inputs: Mapping[str, Tensor],
+    outputs: Sequence[str],
+    expected: Sequence[Tensor] | None = None,
+) -> None:
+    """Write and check a graph; what it should give is what it gives, unless said otherwise."""
+    if expected is None:
+        with torch.inference_mode():
+            found = graph(*inputs.values())
+        expected = [found] if isinstance(found, Tensor) else found
+    tolerances = [TOLERANCE * float(each.std()) + SMALLEST for each in expected]
+    export_graph(graph, inputs, path, outputs=outputs)
+    check_graph(path, inputs, expected, tolerances)
+
+
+def _standardise(network: PaperCVTHead) -> None:
+    """Replace the image encoder's filters by the standardised ones, once for all."""
+    for parent in list(network.encoder.modules()):
+        for name, child in list(parent.named_children()):
+            if isinstance(child, StandardisedConv2d):
+                plain = nn.Conv2d(
+                    child.in_channels,
+                    child.out_channels,
+                    child.kernel_size,  # type: ignore[arg-type]
+                    padding=child.padding,  # type: ignore[arg-type]
+                    bias=False,
+                )
+                plain.weight = nn.Parameter(child.standardised(), requires_grad=False)
+                setattr(parent, name, plain)
+
+
+def _fold(unet: UNet) -> None:
+    """Fold the batch norms into the convolutions before them."""
+    for module in unet.modules():
+        if isinstance(module, ConvNorm):
+            assert isinstance(module.norm, nn.BatchNorm2d), "folded once"
+            module.conv = fuse_conv_bn_eval(module.conv, module.norm)
+            module.norm = nn.Identity()  # type: ignore[assignment]
+
+
+def _pad(unet: UNet) -> None:
+    """Let the first convolution read a multiple of CHANNEL_STEP channels."""
+    first = unet.get_submodule("downs.0.0.conv")
+    assert isinstance(first, nn.Conv2d)
+    count = -first.in_channels % CHANNEL_STEP
+    first.weight = nn.Parameter(F.pad(first.weight, (0, 0, 0, 0, 0, count)), requires_grad=False)
+    first.in_channels += count
