@@ -56,7 +56,8 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.service = service
     problems.install(app)
     middleware.install(app, settings)
-    for module in (avatars, render, track, stream, tickets, page, health, models):
+    # Routes are tried in turn; what is called for every frame comes first.
+    for module in (render, avatars, track, stream, tickets, page, health, models):
         app.include_router(module.router)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app
