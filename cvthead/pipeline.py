@@ -27,6 +27,7 @@ from cvthead.points import FAR_AWAY, PointLayout
 from cvthead.runtime.model_folder import packaged
 from cvthead.runtime.networks import Networks
 from cvthead.runtime.place import Placed, place
+from cvthead.runtime.sessions import CPU
 from cvthead.source import (
     HeadCrop,
     Source,
@@ -55,7 +56,12 @@ class Pipeline:
 
     @classmethod
     def load(
-        cls, preset: str = "open", *, model: Path | None = None, threads: int | None = None
+        cls,
+        preset: str = "open",
+        *,
+        model: Path | None = None,
+        threads: int | None = None,
+        providers: Sequence[str] = CPU,
     ) -> Pipeline:
         """Load head, tracker and trained networks.
 
@@ -64,13 +70,15 @@ class Pipeline:
             model: folder of another model of the preset than the packaged one, as
                 cvthead.training.export writes it.
             threads: of the trained networks; None takes the machine's cores, at most 4.
+            providers: of the trained networks, see cvthead.runtime.sessions; the tracker's run
+                on the CPU.
 
         Raises:
-            AssetError: an unknown preset, or a missing or altered file.
+            AssetError: an unknown preset or provider, or a missing or altered file.
         """
         if preset != "open":
             raise AssetError(f"unknown preset {preset!r}", hint="use the preset 'open'")
-        networks = Networks.load(model or packaged(preset), threads=threads)
+        networks = Networks.load(model or packaged(preset), threads=threads, providers=providers)
         head = HeadModel.load()
         return cls(
             head,

@@ -33,6 +33,7 @@ from cvthead.head.model import HeadModel
 from cvthead.official.avatar import OfficialAvatar, is_official
 from cvthead.official.pipeline import OfficialPipeline
 from cvthead.pipeline import Pipeline
+from cvthead.runtime.sessions import CPU
 from cvthead.tracking.networks import Networks
 from cvthead.tracking.tracker import TrackedFace
 
@@ -100,7 +101,13 @@ class Preset(Protocol[AvatarT]):
     def background(self, avatar: AvatarT) -> NDArray[np.uint8]: ...
 
 
-def load_preset(name: str, *, model: Path | None = None, threads: int | None = None) -> Preset[Any]:
+def load_preset(
+    name: str,
+    *,
+    model: Path | None = None,
+    threads: int | None = None,
+    providers: Sequence[str] = CPU,
+) -> Preset[Any]:
     """The models of a preset.
 
     Args:
@@ -108,14 +115,15 @@ def load_preset(name: str, *, model: Path | None = None, threads: int | None = N
         model: folder of another model than the packaged one; for "official" of another import
             than the default one.
         threads: of the networks; None takes the machine's cores.
+        providers: of the networks, see cvthead.runtime.sessions; the face tracker's run on the CPU.
 
     Raises:
-        AssetError: an unknown preset, or a missing or altered file; for "official": nothing was
-            imported.
+        AssetError: an unknown preset or provider, or a missing or altered file; for "official":
+            nothing was imported.
     """
     if name != "official":
-        return Pipeline.load(name, model=model, threads=threads)
-    return OfficialPipeline.load(model, threads=threads)
+        return Pipeline.load(name, model=model, threads=threads, providers=providers)
+    return OfficialPipeline.load(model, threads=threads, providers=providers)
 
 
 def load_avatar(path: Path) -> Avatar | OfficialAvatar:

@@ -14,6 +14,7 @@ from fastapi.openapi.utils import get_openapi
 
 from cvthead.cache import AvatarCache
 from cvthead.preset import load_preset
+from cvthead.runtime.sessions import CPU
 from service import health, middleware, models, problems
 from service.engine import Engine
 from service.keys import KeyRing, Tickets
@@ -66,7 +67,12 @@ def create_app(settings: Settings) -> FastAPI:
 def build(settings: Settings) -> Service:
     """The parts of the service, loaded and warm, no thread or task started yet."""
     signer = _signer(settings)  # first, because it can fail at once
-    pipeline = load_preset(settings.preset, model=settings.model, threads=settings.threads or None)
+    pipeline = load_preset(
+        settings.preset,
+        model=settings.model,
+        threads=settings.threads or None,
+        providers=settings.providers or CPU,
+    )
     warm_up(pipeline)
     metrics = Metrics()
     metrics.build.info(

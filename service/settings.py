@@ -76,6 +76,12 @@ class Settings(BaseSettings):
         le=1024,
         description="Threads of each neural network; 0 is one per core, at most 4.",
     )
+    providers: Names = Field(
+        (),
+        description="onnxruntime's execution providers for the trained networks, the preferred "
+        "one first, such as `CUDAExecutionProvider` with the package onnxruntime-gpu. Default: "
+        "the CPU, which alone is tested.",
+    )
     store: Path = Field(
         Path("avatars"), description="Folder of the stored avatars; created when missing."
     )
@@ -181,6 +187,7 @@ class Settings(BaseSettings):
 
     @field_validator(
         "keys",
+        "providers",
         "cors_origins",
         "websocket_origins",
         "allowed_hosts",

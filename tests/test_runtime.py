@@ -114,6 +114,12 @@ def test_descriptors_are_the_ones_of_the_float_network(
     assert np.quantile(off[inside], 0.999) < 1.0
 
 
+def test_a_provider_that_is_not_installed_is_refused() -> None:
+    with pytest.raises(AssetError, match="no NoSuchExecutionProvider") as caught:
+        Pipeline.load(providers=("NoSuchExecutionProvider", "CPUExecutionProvider"))
+    assert "CPUExecutionProvider" in str(caught.value.hint)
+
+
 def test_altered_or_missing_files_are_refused(tmp_path: Path) -> None:
     folder = tmp_path / "model"
     shutil.copytree(packaged("open"), folder)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -25,7 +26,7 @@ from cvthead.official.manifest import (
     UNET_ONNX,
     Manifest,
 )
-from cvthead.runtime.sessions import open_session
+from cvthead.runtime.sessions import CPU, open_session
 from cvthead.runtime.threads import cores
 
 Precision = Literal["int8", "float32"]
@@ -91,7 +92,12 @@ class OfficialNetworks:
 
     @classmethod
     def load(
-        cls, folder: Path, *, precision: Precision = "int8", threads: int | None = None
+        cls,
+        folder: Path,
+        *,
+        precision: Precision = "int8",
+        threads: int | None = None,
+        providers: Sequence[str] = CPU,
     ) -> OfficialNetworks:
         """Load an imported model.
 
@@ -100,9 +106,11 @@ class OfficialNetworks:
             precision: wanted of the U-Net; an import whose 8-bit U-Net was not close enough to
                 the float one has the float one alone.
             threads: of each network; None takes the machine's cores.
+            providers: see cvthead.runtime.sessions.
 
         Raises:
-            AssetError: nothing was imported there, or a file is missing, altered or does not fit.
+            AssetError: nothing was imported there; a file is missing, altered or does not fit; or
+                onnxruntime lacks a provider.
         """
         manifest = Manifest.load(folder)
         if UNET_INT8_ONNX not in manifest.sha256:
@@ -115,7 +123,7 @@ class OfficialNetworks:
         count = threads or cores()
 
         def opened(name: str, *, keeps_memory: bool = False) -> Network:
-            session = open_session(str(manifest.checked(name)), count)
+            session = open_session(str(manifest.checked(name)), count, providers)
             return Network(session, keeps_memory)
 
         return cls(

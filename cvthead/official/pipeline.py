@@ -31,6 +31,7 @@ from cvthead.official.networks import OfficialNetworks, Precision, foreground, p
 from cvthead.official.painted import Painted
 from cvthead.official.splat import splat
 from cvthead.official.tracker import OfficialTracker, Picture
+from cvthead.runtime.sessions import CPU
 from cvthead.tracking.tracker import TrackedFace, Tracker
 
 Array = NDArray[np.float32]
@@ -68,6 +69,7 @@ class OfficialPipeline:
         *,
         precision: Precision = "int8",
         threads: int | None = None,
+        providers: Sequence[str] = CPU,
     ) -> OfficialPipeline:
         """Load an imported model.
 
@@ -76,12 +78,16 @@ class OfficialPipeline:
             precision: of the U-Net: "int8", where the import found it close enough to float, or
                 "float32".
             threads: of each network; None takes the machine's cores.
+            providers: of the networks, see cvthead.runtime.sessions; the open tracker's run on
+                the CPU.
 
         Raises:
-            AssetError: nothing was imported there, or it is damaged.
+            AssetError: nothing was imported there, it is damaged, or onnxruntime lacks a provider.
         """
         folder = folder or default_folder()
-        networks = OfficialNetworks.load(folder, precision=precision, threads=threads)
+        networks = OfficialNetworks.load(
+            folder, precision=precision, threads=threads, providers=providers
+        )
         finder, flame = Tracker.load(), networks.flame
         head = flame.head()
         arkit = fit_arkit(flame, finder.head, ArkitMap.load())

@@ -14,7 +14,7 @@ from cvthead.deformation import MAX_SHELL_POINTS
 from cvthead.runtime.mix import mix
 from cvthead.runtime.model_folder import DESCRIBE, PAINT, ModelFolder
 from cvthead.runtime.place import Placed, code_size
-from cvthead.runtime.sessions import open_session
+from cvthead.runtime.sessions import CPU, open_session
 from cvthead.runtime.subpixels import unshuffled
 from cvthead.runtime.threads import cores
 from cvthead.source import Source
@@ -43,19 +43,24 @@ class Networks:
     preset: str
 
     @classmethod
-    def load(cls, path: Path, *, threads: int | None = None) -> Networks:
+    def load(
+        cls, path: Path, *, threads: int | None = None, providers: Sequence[str] = CPU
+    ) -> Networks:
         """Open the networks of a model folder.
 
         Args:
             path: the folder.
             threads: of each network; None takes the machine's cores, at most 4.
+            providers: see cvthead.runtime.sessions.
 
         Raises:
-            AssetError: a file is missing or altered.
+            AssetError: a file is missing or altered, or onnxruntime lacks a provider.
         """
         folder = ModelFolder.load(path)
         count = threads or min(MAX_THREADS, cores())
-        describe, paint = (open_session(folder.read(name), count) for name in (DESCRIBE, PAINT))
+        describe, paint = (
+            open_session(folder.read(name), count, providers) for name in (DESCRIBE, PAINT)
+        )
         _, size, _, channels = paint.get_inputs()[0].shape
         descriptors = channels - code_size(0)
         return cls(describe, paint, descriptors, size, folder.fingerprint, folder.preset)

@@ -2,20 +2,40 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import onnxruntime as ort
 
+from cvthead.errors import AssetError
 
-def open_session(network: bytes | str, threads: int) -> ort.InferenceSession:
-    """A network on the CPU.
+CPU = ("CPUExecutionProvider",)
+
+
+def open_session(
+    network: bytes | str, threads: int, providers: Sequence[str] = CPU
+) -> ort.InferenceSession:
+    """A network, ready to run.
 
     Args:
         network: contents of an ONNX file, or its path.
         threads: intra-operator threads, at least 1.
+        providers: onnxruntime's execution providers in the order of preference, such as
+            "CUDAExecutionProvider"; what they cannot run, the CPU does.
+
+    Raises:
+        AssetError: the installed onnxruntime lacks a provider.
     """
+    available = ort.get_available_providers()
+    for provider in providers:
+        if provider not in available:
+            raise AssetError(
+                f"onnxruntime has no {provider}",
+                hint=f"use one of {', '.join(available)}, or install another build of onnxruntime",
+            )
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
     options.log_severity_level = 3
     # Threads that wait for the next run would take a core from whatever handles the result.
     options.add_session_config_entry("session.force_spinning_stop", "1")
-    return ort.InferenceSession(network, options, providers=["CPUExecutionProvider"])
+    return ort.InferenceSession(network, options, providers=list(providers))
