@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Self
 
 import cv2
 import numpy as np
@@ -22,6 +23,13 @@ class Frame:
 
     rgb: Image
     alpha: Image
+
+    @classmethod
+    def of_rgba(cls, rgba: Image) -> Self:
+        """From (256, 256, 4) uint8, straight alpha. OpenCV separates channels many times faster
+        than NumPy."""
+        rgb, alpha = cv2.cvtColor(rgba, cv2.COLOR_RGBA2RGB), cv2.extractChannel(rgba, 3)
+        return cls(np.asarray(rgb, np.uint8), np.asarray(alpha, np.uint8))
 
     def over(self, background: tuple[int, int, int] | Image) -> Image:
         """(256, 256, 3) uint8: the head over a colour or an image of the same size."""

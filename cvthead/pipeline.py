@@ -199,10 +199,7 @@ class Pipeline:
             self._check(avatar)
             inputs.append(self.place(avatar, points))
         painted = self.networks.paint(inputs)
-        return [
-            Frame(np.asarray(cv2.cvtColor(rgba, cv2.COLOR_RGBA2RGB), np.uint8), rgba[..., 3].copy())
-            for rgba in painted
-        ]
+        return [Frame.of_rgba(rgba) for rgba in painted]
 
     def _check(self, avatar: Avatar) -> None:
         """Refuse an avatar of other weights, or one whose arrays do not fit (a forged file)."""

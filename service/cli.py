@@ -8,8 +8,7 @@ import socket
 from pathlib import Path
 
 from cvthead.errors import InputError
-
-SAMPLE = Path(__file__).parent / "static" / "sample.jpg"
+from cvthead.sample import SAMPLE
 
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

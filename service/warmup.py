@@ -6,7 +6,7 @@ from typing import Any
 
 from cvthead.images import encode_image, read_image
 from cvthead.preset import Preset
-from service.cli import SAMPLE
+from cvthead.sample import SAMPLE
 
 
 def warm_up(pipeline: Preset[Any]) -> None:

@@ -33,6 +33,7 @@ from cvthead.points import FAR_AWAY
 from cvthead.runtime.model_folder import WEIGHTS, packaged
 from cvthead.runtime.threads import one_thread_per_call
 from cvthead.source import Source, as_network_input, cut_head, read_source
+from cvthead.training.static_int8 import psnr
 from cvthead.weights import load_into
 
 Image = NDArray[np.uint8]
@@ -75,15 +76,21 @@ class FloatNetwork:
         )
         return self.model.describe(image, points, seen, anchors)
 
-    def paint(self, avatar: Avatar, source: Source, points: NDArray[np.float32]) -> Frame:
-        """The frame of driven points (P, 3), before any rounding but the last."""
+    def paint(
+        self, avatar: Avatar, source: Source, descriptors: Tensor, points: NDArray[np.float32]
+    ) -> Frame:
+        """The frame of driven points (P, 3), before any rounding but the last.
+
+        Args:
+            descriptors: of :meth:`describe`.
+        """
         layout = self.pipeline.layout
         every = np.tile(FAR_AWAY, (layout.total, 1))
         every[: len(points)] = points
         placed = self.pipeline.place(avatar, points)
         rgb, logits = self.model.paint(
             torch.from_numpy(every)[None],
-            self.describe(source),
+            descriptors,
             torch.from_numpy(source.places(layout)[None, :, 2]),
             torch.from_numpy(as_network_input(placed.warped))[None],
         )
@@ -94,12 +101,6 @@ class FloatNetwork:
         return Frame(np.ascontiguousarray(pixels), np.minimum(mask, placed.reach))
 
 
-def psnr(a: Image, b: Image) -> float:
-    """dB between two pictures, at most 100."""
-    error = float(np.square(a.astype(np.float64) - b).mean())
-    return min(100.0, 10 * float(np.log10(255**2 / max(error, 1e-9))))
-
-
 def compare(network: FloatNetwork, portrait: Path) -> tuple[Grid, list[float]]:
     """Rows of served, float32 and magnified difference for each pose; and their PSNR, dB."""
     pipeline = network.pipeline
@@ -107,13 +108,14 @@ def compare(network: FloatNetwork, portrait: Path) -> tuple[Grid, list[float]]:
     avatar = pipeline.encode(image)
     crop = cut_head(pipeline.tracker, image, pipeline.tracker.track(image))
     source = read_source(pipeline.deformer, pipeline.layout, crop)
+    descriptors = network.describe(source)
     rows, distances = {}, []
     for name, controls in POSES.items():
         pose = resolve(avatar.coefficients, avatar.camera, controls, pipeline.arkit)
         points = pipeline.pose(avatar, *pose)
-        served = pipeline.paint(avatar, points).over(WHITE)
-        exact = network.paint(avatar, source, points).over(WHITE)
-        distances.append(psnr(served, exact))
+        frames = pipeline.paint(avatar, points), network.paint(avatar, source, descriptors, points)
+        distances.append(psnr(*(frame.rgba() for frame in frames)))
+        served, exact = (frame.over(WHITE) for frame in frames)
         off = cv2.convertScaleAbs(cv2.absdiff(served, exact), alpha=MAGNIFIED)
         rows[f"{name}: {distances[-1]:.1f} dB"] = (served, exact, off.astype(np.uint8))
     titles = ("served (8-bit)", "float32", f"difference x {MAGNIFIED}")

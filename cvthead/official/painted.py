@@ -34,9 +34,7 @@ class Painted:
         codes += 1
         codes *= 127.5
         # Rounds halves to even and stays within 0..255.
-        rgba = cv2.convertScaleAbs(codes)
-        rgb, alpha = cv2.cvtColor(rgba, cv2.COLOR_RGBA2RGB), cv2.extractChannel(rgba, 3)
-        return Frame(np.asarray(rgb, np.uint8), np.asarray(alpha, np.uint8))
+        return Frame.of_rgba(np.asarray(cv2.convertScaleAbs(codes), np.uint8))
 
     def over_white(self, threshold: float | None = None) -> Image:
         """The painted head over white, as the released code writes it.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +12,14 @@ from numpy.typing import NDArray
 
 from cvthead.coefficients import EXPRESSION_SIZE
 from cvthead.controls import Controls, resolve
-from cvthead.images import decode_image
+from cvthead.images import read_image
 from cvthead.official.manifest import MIN_UNET_PSNR, UNET_INT8_ONNX, UNET_ONNX
 from cvthead.official.networks import Network
 from cvthead.official.painted import Painted
 from cvthead.official.pipeline import OfficialPipeline
 from cvthead.runtime.sessions import open_session
 from cvthead.runtime.threads import cores
+from cvthead.sample import SAMPLE
 from cvthead.training.static_int8 import (
     Feed,
     Overrides,
@@ -32,7 +32,6 @@ from cvthead.training.static_int8 import (
 
 CALIBRATION, HELD_OUT = 8, 4
 SEED = 5
-SAMPLE = "sample.jpg"
 INPUT = "splat"
 LARGEST_TURN = np.array([0.3, 0.7, 0.3])  # radians
 LARGEST_JAW = 0.4
@@ -86,7 +85,7 @@ def _overrides(network: onnx.ModelProto, feeds: Sequence[Feed]) -> Overrides:
 
 def sample_views(pipeline: OfficialPipeline, count: int) -> list[Array]:
     """What the U-Net reads of the sample portrait and of its mirror image, in seeded poses."""
-    portrait = decode_image(resources.files("cvthead").joinpath("assets", SAMPLE).read_bytes())
+    portrait = read_image(SAMPLE)
     avatars = [pipeline.encode(image) for image in (portrait, portrait[:, ::-1].copy())]
     random = np.random.default_rng(SEED)
     views = []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cvthead.runtime.splat import EMPTY, EMPTY_DEPTH
+from cvthead.runtime.splat import EMPTY_DEPTH, front_points
 
 Array = NDArray[np.float32]
 
@@ -26,11 +26,8 @@ def nearest_points(points: Array, size: int) -> NDArray[np.int64]:
     """
     half = np.float32(size / 2)
     place = np.rint((points[:, :2] * half + half).clip(0, size - 1)).astype(np.int64)
-    # Farthest first, so that the last writer of a pixel is the nearest point.
-    order = np.argsort(-points[:, 2], kind="stable")
-    owner = np.full(size * size, EMPTY, np.int64)
-    owner[place[order, 1] * size + place[order, 0]] = order
-    return owner
+    depth = np.ascontiguousarray(points[:, 2])
+    return front_points(place[:, 1] * size + place[:, 0], depth, size * size)
 
 
 def splat(points: Array, descriptors: Array, size: int, channels: int) -> Array:

@@ -34,14 +34,30 @@ def splat(points: Array, size: int) -> NDArray[np.int64]:
     nearest = np.full((size // BLOCK) ** 2, np.inf, np.float32)
     np.minimum.at(nearest, block, depth)
     front = np.nonzero(depth <= nearest[block] + np.float32(FRONT))[0]
+    owner = front_points(row[front] * size + column[front], depth[front], size * size)
+    shown = owner >= 0
+    owner[shown] = inside[front[owner[shown]]]
+    return owner.reshape(size, size)
+
+
+def front_points(pixel: NDArray[np.int64], depth: Array, count: int) -> NDArray[np.int64]:
+    """The nearest of the points at each pixel.
+
+    Args:
+        pixel: (P,) number of each point's pixel.
+        depth: (P,) the nearest has the smallest.
+        count: of the pixels.
+
+    Returns:
+        (count,) point number, EMPTY where there is none. Of points at equal depth the one with the
+        higher number wins.
+    """
     # Depth and number in one integer, whose minimum is the nearest point of the highest number: a
     # fraction of the time of sorting them.
-    key = _ordered(depth[front]) << 32
-    key -= inside[front]
-    first = np.full(size * size, NOTHING, np.int64)
-    np.minimum.at(first, row[front] * size + column[front], key)
-    owner = np.where(first == NOTHING, EMPTY, -first & NUMBER)
-    return owner.reshape(size, size)
+    key = (_ordered(depth) << 32) - np.arange(len(depth))
+    first = np.full(count, NOTHING, np.int64)
+    np.minimum.at(first, pixel, key)
+    return np.where(first == NOTHING, EMPTY, -first & NUMBER)
 
 
 def _pixel(coordinate: Array, size: int) -> NDArray[np.int64]:
@@ -51,5 +67,5 @@ def _pixel(coordinate: Array, size: int) -> NDArray[np.int64]:
 
 def _ordered(values: Array) -> NDArray[np.int64]:
     """Integers in the order of the float32 values."""
-    bits = values.view(np.int32)
+    bits = (values + np.float32(0)).view(np.int32)  # -0 becomes 0
     return np.where(bits < 0, bits ^ np.int32(0x7FFFFFFF), bits).astype(np.int64)

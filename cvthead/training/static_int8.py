@@ -34,7 +34,6 @@ def quantise_network(
     source: Path,
     feeds: Sequence[Feed],
     overrides: Callable[[onnx.ModelProto], Overrides],
-    excluded: Sequence[str] = (),
 ) -> onnx.ModelProto:
     """The 8-bit network, still with float inputs and outputs.
 
@@ -42,7 +41,6 @@ def quantise_network(
         source: float network.
         feeds: inputs that give the ranges of the activations.
         overrides: the network as it is quantised -> scales that calibration must not choose.
-        excluded: names of nodes that stay in float.
     """
     with tempfile.TemporaryDirectory() as folder:
         prepared, simulated = Path(folder) / "prepared.onnx", Path(folder) / "simulated.onnx"
@@ -52,7 +50,6 @@ def quantise_network(
             str(simulated),
             _Feeds(feeds),
             op_types_to_quantize=list(QUANTISED),
-            nodes_to_exclude=list(excluded),
             quant_format=QuantFormat.QDQ,
             per_channel=True,
             activation_type=QuantType.QUInt8,

@@ -8,6 +8,8 @@ from fastapi import APIRouter, Request
 from starlette.responses import Response
 from starlette.staticfiles import StaticFiles
 
+from cvthead.sample import SAMPLE
+
 STATIC = Path(__file__).parents[1] / "static"
 # Only files of this service, no inline script or style; pictures may also come from memory.
 CONTENT_SECURITY_POLICY = "; ".join(
@@ -39,13 +41,19 @@ async def page(request: Request) -> Response:
     return await _file("index.html", request)
 
 
+@router.api_route(f"/static/{SAMPLE.name}", methods=["GET", "HEAD"])
+async def sample(request: Request) -> Response:
+    """The sample portrait, which belongs to the core package."""
+    return await _file(SAMPLE.name, request, SAMPLE.parent)
+
+
 @router.api_route("/static/{name}", methods=["GET", "HEAD"])
 async def static(name: str, request: Request) -> Response:
     """A script, style or picture of the page; 404 for any other name."""
     return await _file(name, request)
 
 
-async def _file(name: str, request: Request) -> Response:
-    response = await StaticFiles(directory=STATIC).get_response(name, request.scope)
+async def _file(name: str, request: Request, folder: Path = STATIC) -> Response:
+    response = await StaticFiles(directory=folder).get_response(name, request.scope)
     response.headers.update(HEADERS)
     return response
