@@ -202,6 +202,8 @@ def batches(
         Subset(dataset, numbers),
         share,
         num_workers=config.workers,
+        # A forked worker hangs when OpenCV had threads in this process.
+        multiprocessing_context="spawn" if config.workers else None,
         prefetch_factor=4 if config.workers else None,
     )
     for batch in loader:
