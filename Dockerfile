@@ -9,7 +9,7 @@ RUN --mount=type=cache,target=/root/.cache/pip \
     /opt/cvthead/bin/pip install --disable-pip-version-check .
 
 FROM python:3.11-slim
-RUN useradd --system --uid 10001 --no-create-home --shell /usr/sbin/nologin cvthead \
+RUN useradd --uid 10001 --no-create-home --shell /usr/sbin/nologin cvthead \
     && install --directory --owner 10001 --mode 0700 /var/lib/cvthead
 COPY --from=build /opt/cvthead /opt/cvthead
 # HOME: the root file system is read-only, and libraries that want a cache find /tmp.
