@@ -23,9 +23,9 @@ from cvthead.official.flame import from_checkpoint, from_files
 from cvthead.official.importer import import_official, read_release
 from cvthead.official.keys import part, released_shapes
 from cvthead.official.manifest import (
+    EIGHT_BIT,
     FILES,
     LICENCES,
-    OPTIONAL_FILES,
     RECORD,
     WEIGHTS,
     Manifest,
@@ -45,7 +45,7 @@ def test_sources_hashes_and_licences_are_recorded(folder: Path) -> None:
     record = json.loads((folder / "model" / "model.json").read_text())
     assert {source["name"] for source in record["sources"]} == {"cvthead.pt", "data/transform.pkl"}
     names = {path.name for path in (folder / "model").iterdir()}
-    assert names - set(OPTIONAL_FILES) == {*FILES, RECORD}
+    assert names - set(EIGHT_BIT.values()) == {*FILES, RECORD}
     assert len(record["licences"]) == len(LICENCES)
     for licence in LICENCES:
         assert licence.licence in said

@@ -12,7 +12,7 @@ import onnx
 import pytest
 import torch
 
-from cvthead.cli.import_official import painting
+from cvthead.cli.import_official import precisions
 from cvthead.cli.main import main
 from cvthead.controls import Controls
 from cvthead.frame import Frame
@@ -21,8 +21,10 @@ from cvthead.model.bisenet import foreground as torch_foreground
 from cvthead.model.splat import splat_clamped
 from cvthead.official.avatar import OfficialAvatar
 from cvthead.official.manifest import (
+    DESCRIBE_INT8_ONNX,
+    EIGHT_BIT,
     FILES,
-    MIN_UNET_PSNR,
+    MIN_PSNR,
     UNET_INT8_ONNX,
     UNET_ONNX,
     Manifest,
@@ -31,7 +33,13 @@ from cvthead.official.manifest import (
 from cvthead.official.networks import Network, foreground
 from cvthead.official.painted import Painted
 from cvthead.official.pipeline import OfficialPipeline
-from cvthead.official.quantise import quantised, sample_views, write_if_close
+from cvthead.official.quantise import (
+    quantised_unet,
+    sample_views,
+    source_of,
+    write_encoder_if_close,
+    write_unet_if_close,
+)
 from cvthead.official.splat import splat
 from cvthead.runtime.sessions import open_session
 from cvthead.training.static_int8 import psnr
@@ -90,18 +98,27 @@ def test_frame_rounds_and_over_white_truncates() -> None:
     assert difference.max() < 1.001
 
 
-def test_the_eight_bit_unet_paints_what_the_float_one_does(
+def test_the_eight_bit_networks_paint_what_the_float_ones_do(
     model: Path, pipeline: OfficialPipeline, avatar: OfficialAvatar
 ) -> None:
-    """And is served, with the made-up weights, unless it is not close enough."""
+    """And are served, with the made-up weights, unless they are not close enough."""
     served = OfficialPipeline.load(model)
-    close = (served.networks.manifest.unet_psnr or 0) >= MIN_UNET_PSNR
-    assert served.networks.precision == ("int8" if close else "float32")
-    assert pipeline.networks.precision == "float32"
+    close = {
+        name: served.networks.manifest.psnr[small] >= MIN_PSNR[small]
+        for name, small in EIGHT_BIT.items()
+    }
+    assert any(close.values())
+    assert served.networks.precision == {
+        name: "int8" if good else "float32" for name, good in close.items()
+    }
+    assert set(pipeline.networks.precision.values()) == {"float32"}
     controls = Controls(global_rotation=(0, 0.2, 0), mode="relative")
-    frames = [each.render(avatar, controls).rgba() for each in (served, pipeline)]
-    assert psnr(*frames) > MIN_UNET_PSNR - 3
-    assert np.array_equal(frames[0], frames[1]) != close
+    frames = [
+        each.render(each.encode(read_image(PORTRAIT)), controls).rgba()
+        for each in (served, pipeline)
+    ]
+    assert psnr(*frames) > MIN_PSNR[UNET_INT8_ONNX] - 3
+    assert not np.array_equal(frames[0], frames[1])
 
 
 @pytest.fixture(scope="module")
@@ -132,23 +149,35 @@ def uneven(model: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_poor_eight_bit_unet_is_not_served(
     uneven: Path, pipeline: OfficialPipeline, avatar: OfficialAvatar
 ) -> None:
-    views = sample_views(pipeline, 3)
-    lowest = write_if_close(uneven, views[:2], views[2:])
-    assert lowest < MIN_UNET_PSNR
-    write_manifest(uneven, (), lowest)
+    views = sample_views(pipeline, [read_image(PORTRAIT)], 3)
+    lowest = write_unet_if_close(uneven, views[:2], views[2:])
+    assert lowest < MIN_PSNR[UNET_INT8_ONNX]
+    write_manifest(uneven, (), {UNET_INT8_ONNX: lowest, DESCRIBE_INT8_ONNX: 0})
     record = Manifest.load(uneven)
     assert UNET_INT8_ONNX not in record.sha256
-    assert "the float one paints the frames" in painting(record)
+    assert f"{UNET_ONNX} is served" in precisions(record)
     served = OfficialPipeline.load(uneven)
-    assert served.networks.precision == "float32"
+    assert served.networks.precision[UNET_ONNX] == "float32"
     frames: list[Frame] = [each.render(avatar) for each in (served, pipeline)]
     assert psnr(*(frame.rgba() for frame in frames)) > 60
 
 
+def test_a_poor_eight_bit_encoder_is_not_served(uneven: Path, avatar: OfficialAvatar) -> None:
+    """One that was calibrated on a black picture has no range for a portrait."""
+    exact = OfficialPipeline.load(uneven, precision="float32")
+    portrait = read_image(PORTRAIT)
+    black = {
+        name: np.zeros_like(value) for name, value in source_of(exact, portrait, avatar).items()
+    }
+    lowest = write_encoder_if_close(exact, [black], [portrait])
+    assert lowest < MIN_PSNR[DESCRIBE_INT8_ONNX]
+    assert not (uneven / DESCRIBE_INT8_ONNX).exists()
+
+
 def test_the_last_layer_stays_in_float(pipeline: OfficialPipeline, model: Path) -> None:
     """Colours before tanh have no range that fits 256 steps."""
-    views = sample_views(pipeline, 1)
-    network = quantised(model / UNET_ONNX, views)
+    views = sample_views(pipeline, [read_image(PORTRAIT)], 1)
+    network = quantised_unet(model / UNET_ONNX, views)
     small = Network(open_session(network.SerializeToString(), 1), keeps_memory=True)
     (raw,) = small(views[0])
     assert len(np.unique(raw[..., 0])) > 256
@@ -187,5 +216,5 @@ def test_bench_names_every_stage(
     assert set(report["render"]) == frame | pictures
     assert set(report["drive"]) == {"decode JPEG", "track", "render", "to JPEG", "JPEG to JPEG"}
     assert set(report["torch"]) == set(report["ratios"]) == {"official preset"}
-    assert report["precision"] in ("int8", "float32")
+    assert set(report["precision"]) == set(EIGHT_BIT)
     assert report["preset"] == "official"

@@ -75,11 +75,11 @@ def time_open(image: NDArray[np.uint8], face: int | None, renders: int, threads:
 
 
 def time_official(image: NDArray[np.uint8], face: int | None, renders: int, threads: int) -> Report:
-    """Stages of the official preset, and the precision of its U-Net."""
+    """Stages of the official preset, and the precision of its networks."""
     pipeline = OfficialPipeline.load(threads=threads)
     avatar = pipeline.encode(image, face=face)
     report: Report = {
-        "precision": pipeline.networks.precision,
+        "precision": dict(pipeline.networks.precision),
         "encode": official_benchmark.time_encode(pipeline, image, face),
         "render": official_benchmark.time_render(pipeline, avatar, renders),
         "drive": benchmark.time_drive(pipeline, avatar, image, renders),
@@ -100,8 +100,9 @@ def ratios(report: dict[str, Any]) -> dict[str, float]:
 
 
 def table(report: dict[str, Any]) -> str:
-    facts = ("preset", "precision", "threads")
-    lines = [f"{name:<24}{report[name]:>9}" for name in facts if name in report]
+    facts = {"preset": report["preset"], "threads": report["threads"]}
+    facts |= report.get("precision", {})
+    lines = [f"{name:<24}{value:>9}" for name, value in facts.items()]
     for key, title in TITLES.items():
         if report[key] is None:
             lines += ["", f"{title}: not installed (pip install 'cvthead[train]')"]

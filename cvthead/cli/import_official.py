@@ -9,9 +9,9 @@ from pathlib import Path
 from cvthead.errors import InputError
 from cvthead.files import write_errors
 from cvthead.official.manifest import (
+    EIGHT_BIT,
     LICENCES,
-    MIN_UNET_PSNR,
-    UNET_INT8_ONNX,
+    MIN_PSNR,
     Manifest,
     default_folder,
 )
@@ -62,16 +62,19 @@ def run(args: argparse.Namespace) -> None:
             output.parent.mkdir(parents=True, exist_ok=True)
     for source in import_official(args.folder, output, replace=args.replace):
         print(f"{source.name}: {', '.join(source.used_for)}")
-    print(f"\n{painting(Manifest.load(output))}")
+    print(f"\n{precisions(Manifest.load(output))}")
     print("\nLicences of what was imported; none of it is part of cvthead:")
     for licence in LICENCES:
         print(f"- {licence.part}: {licence.licence}; {licence.page}")
     print(f"\n{output}")
 
 
-def painting(model: Manifest) -> str:
-    """Which U-Net paints the frames of an import, and why."""
-    distance = f"the 8-bit U-Net is {model.unet_psnr:.1f} dB from the float one"
-    if UNET_INT8_ONNX in model.sha256:
-        return f"{distance} and paints the frames"
-    return f"{distance}, {MIN_UNET_PSNR:g} are wanted: the float one paints the frames"
+def precisions(model: Manifest) -> str:
+    """Which networks of an import are served in 8 bits, and why."""
+    lines = []
+    for exact, small in EIGHT_BIT.items():
+        served = f"it is served instead of {exact}"
+        if small not in model.sha256:
+            served = f"{MIN_PSNR[small]:g} are wanted: {exact} is served"
+        lines.append(f"{small}: pictures {model.psnr[small]:.1f} dB from the float ones; {served}")
+    return "\n".join(lines)

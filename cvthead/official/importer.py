@@ -26,12 +26,12 @@ from cvthead.official.export import export_networks
 from cvthead.official.keys import check, part, released_shapes
 from cvthead.official.manifest import (
     DECA,
+    EIGHT_BIT,
     FILES,
     FLAME,
     HAIR,
     MESH,
     NETWORK,
-    OPTIONAL_FILES,
     PARSING,
     RECORD,
     SourceFile,
@@ -39,7 +39,7 @@ from cvthead.official.manifest import (
     write_manifest,
 )
 from cvthead.official.mesh import read_hierarchy
-from cvthead.official.quantise import quantise_unet
+from cvthead.official.quantise import quantise
 
 State = dict[str, Tensor]
 Files = Mapping[str, Mapping[str, Tensor]]
@@ -179,7 +179,7 @@ def import_official(source: Path, output: Path, *, replace: bool = False) -> tup
     with new as temporary, write_errors(output):
         write_model(temporary, files, sources)
         # It is calibrated on what the float networks paint.
-        write_manifest(temporary, sources, quantise_unet(temporary))
+        write_manifest(temporary, sources, quantise(temporary))
     return sources
 
 
@@ -223,7 +223,7 @@ def check_output(output: Path, *, replace: bool) -> None:
         raise InputError(
             f"{output} is already there", hint="replace it with --replace, or choose another -o"
         )
-    if others := found - {*FILES, *OPTIONAL_FILES, RECORD}:
+    if others := found - {*FILES, *EIGHT_BIT.values(), RECORD}:
         raise InputError(
             f"{output} holds more than an import: {', '.join(sorted(others)[:5])}",
             hint="choose another folder with -o",

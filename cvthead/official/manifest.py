@@ -15,7 +15,7 @@ from cvthead.errors import AssetError
 from cvthead.files import write_file
 
 RECORD = "model.json"
-VERSION = 2
+VERSION = 3
 PRESET = "official"
 NETWORK = "cvthead.safetensors"
 PARSING = "face_parsing.safetensors"
@@ -29,12 +29,15 @@ PARSING_ONNX = "face_parsing.onnx"
 HAIR_ONNX = "hair.onnx"
 DECA_ONNX = "deca.onnx"
 DESCRIBE_ONNX = "describe.onnx"
+DESCRIBE_INT8_ONNX = "describe_int8.onnx"
 UNET_ONNX = "unet.onnx"
 UNET_INT8_ONNX = "unet_int8.onnx"
 NETWORKS = (PARSING_ONNX, HAIR_ONNX, DECA_ONNX, DESCRIBE_ONNX, UNET_ONNX)
 FILES = (*WEIGHTS, *NETWORKS)
-OPTIONAL_FILES = (UNET_INT8_ONNX,)
-MIN_UNET_PSNR = 40.0  # dB of the 8-bit U-Net to the float one; below it that one is served
+# What is served instead of a float network, if its pictures are close enough.
+EIGHT_BIT = {UNET_ONNX: UNET_INT8_ONNX, DESCRIBE_ONNX: DESCRIBE_INT8_ONNX}
+# dB of those pictures to the float ones. The encoder's share of the error is to be small.
+MIN_PSNR = {UNET_INT8_ONNX: 40.0, DESCRIBE_INT8_ONNX: 46.0}
 HINT = "import the official files again with `cvthead import-official`"
 FOLDER_VARIABLE = "CVTHEAD_OFFICIAL"
 WEIGHTS_PART = "CVTHead weights and tables (cvthead.pt, data/)"
@@ -96,15 +99,16 @@ class Manifest:
         folder: where it lies.
         fingerprint: 16 hex digits of all weights; avatars remember it.
         sources: the files it was made from.
-        sha256: of each of FILES, and of those of OPTIONAL_FILES that are there.
-        unet_psnr: dB of the 8-bit U-Net to the float one; None before it was made.
+        sha256: of each of FILES, and of the 8-bit ones that are there.
+        psnr: 8-bit file -> dB of the pictures made with it, and everything else in float, to the
+            float ones; also where that was too little.
     """
 
     folder: Path
     fingerprint: str
     sources: tuple[SourceFile, ...]
     sha256: Mapping[str, str]
-    unet_psnr: float | None
+    psnr: Mapping[str, float]
 
     @classmethod
     def load(cls, folder: Path) -> Manifest:
@@ -130,17 +134,16 @@ class Manifest:
             sha256 = {name: str(record["sha256"][name]) for name in FILES}
             sha256 |= {
                 name: str(record["sha256"][name])
-                for name in OPTIONAL_FILES
+                for name in EIGHT_BIT.values()
                 if name in record["sha256"]
             }
-            stored = record["unet_psnr"]
-            unet_psnr = None if stored is None else float(stored)
+            psnr = {str(name): float(value) for name, value in record["psnr"].items()}
             fingerprint = str(record["fingerprint"])
             if not re.fullmatch("[0-9a-f]{16}", fingerprint):
                 raise ValueError("no fingerprint")
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise AssetError(f"{path} is not an imported model: {error!r}", hint=HINT) from error
-        return cls(folder, fingerprint, sources, sha256, unet_psnr)
+        return cls(folder, fingerprint, sources, sha256, psnr)
 
     def checked(self, name: str) -> Path:
         """Path of a file of the import, after comparing its hash.
@@ -159,10 +162,10 @@ class Manifest:
 
 
 def write_manifest(
-    folder: Path, sources: tuple[SourceFile, ...], unet_psnr: float | None = None
+    folder: Path, sources: tuple[SourceFile, ...], psnr: Mapping[str, float] | None = None
 ) -> None:
-    """Write ``model.json`` for the FILES and OPTIONAL_FILES in ``folder``."""
-    names = [*FILES, *(name for name in OPTIONAL_FILES if (folder / name).is_file())]
+    """Write ``model.json`` for the FILES and the 8-bit ones in ``folder``."""
+    names = [*FILES, *(name for name in EIGHT_BIT.values() if (folder / name).is_file())]
     sha256 = {name: file_sha256(folder / name) for name in names}
     # Of the weights alone: an avatar stays what it is when the networks are exported anew.
     digest = hashlib.sha256("".join(sha256[name] for name in WEIGHTS).encode())
@@ -172,7 +175,7 @@ def write_manifest(
         "fingerprint": digest.hexdigest()[:16],
         "sources": [asdict(source) for source in sources],
         "licences": [asdict(licence) for licence in LICENCES],
-        "unet_psnr": unet_psnr,
+        "psnr": dict(psnr or {}),
         "sha256": sha256,
     }
     write_file(folder / RECORD, (json.dumps(record, indent=2) + "\n").encode())

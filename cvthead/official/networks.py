@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -18,11 +18,11 @@ from cvthead.official.flame import Flame
 from cvthead.official.manifest import (
     DECA_ONNX,
     DESCRIBE_ONNX,
+    EIGHT_BIT,
     FLAME,
     HAIR_ONNX,
     HINT,
     PARSING_ONNX,
-    UNET_INT8_ONNX,
     UNET_ONNX,
     Manifest,
 )
@@ -78,7 +78,7 @@ class OfficialNetworks:
             -> (1, 5023, 32) descriptors.
         unet: (1, 256, 256, channels) splat -> (1, 256, 256, 4) RGB before tanh, mask before
             sigmoid.
-        precision: of the U-Net; everything else is float32.
+        precision: file -> of each network that has an 8-bit form; the others are float32.
     """
 
     manifest: Manifest
@@ -88,7 +88,7 @@ class OfficialNetworks:
     deca: Network
     describe: Network
     unet: Network
-    precision: Precision
+    precision: Mapping[str, Precision]
 
     @classmethod
     def load(
@@ -103,8 +103,8 @@ class OfficialNetworks:
 
         Args:
             folder: of the import.
-            precision: wanted of the U-Net; an import whose 8-bit U-Net was not close enough to
-                the float one has the float one alone.
+            precision: "int8" serves the 8-bit U-Net and image encoder where the import found
+                them close enough to float; "float32" never does.
             threads: of each network; None takes the machine's cores.
             providers: see cvthead.runtime.sessions.
 
@@ -113,9 +113,10 @@ class OfficialNetworks:
                 onnxruntime lacks a provider.
         """
         manifest = Manifest.load(folder)
-        if UNET_INT8_ONNX not in manifest.sha256:
-            precision = "float32"
-        unet = UNET_INT8_ONNX if precision == "int8" else UNET_ONNX
+        chosen: dict[str, Precision] = {
+            name: precision if small in manifest.sha256 else "float32"
+            for name, small in EIGHT_BIT.items()
+        }
         try:
             flame = Flame(**load_file(manifest.checked(FLAME)))
         except (SafetensorError, TypeError) as error:
@@ -123,7 +124,8 @@ class OfficialNetworks:
         count = threads or cores()
 
         def opened(name: str, *, keeps_memory: bool = False) -> Network:
-            session = open_session(str(manifest.checked(name)), count, providers)
+            served = EIGHT_BIT[name] if chosen.get(name) == "int8" else name
+            session = open_session(str(manifest.checked(served)), count, providers)
             return Network(session, keeps_memory)
 
         return cls(
@@ -133,8 +135,8 @@ class OfficialNetworks:
             opened(HAIR_ONNX),
             opened(DECA_ONNX, keeps_memory=True),
             opened(DESCRIBE_ONNX),
-            opened(unet, keeps_memory=True),
-            precision,
+            opened(UNET_ONNX, keeps_memory=True),
+            chosen,
         )
 
 

@@ -75,8 +75,8 @@ class OfficialPipeline:
 
         Args:
             folder: of the import; None takes :func:`default_folder`.
-            precision: of the U-Net: "int8", where the import found it close enough to float, or
-                "float32".
+            precision: "int8" serves the 8-bit U-Net and image encoder where the import found
+                them close enough to float; "float32" never does.
             threads: of each network; None takes the machine's cores.
             providers: of the networks, see cvthead.runtime.sessions; the open tracker's run on
                 the CPU.

@@ -33,7 +33,9 @@ class _Feeds(CalibrationDataReader):  # type: ignore[misc]
 def quantise_network(
     source: Path,
     feeds: Sequence[Feed],
-    overrides: Callable[[onnx.ModelProto], Overrides],
+    overrides: Callable[[onnx.ModelProto], Overrides] | None = None,
+    operators: Sequence[str] = QUANTISED,
+    first: int = 0,
 ) -> onnx.ModelProto:
     """The 8-bit network, still with float inputs and outputs.
 
@@ -41,20 +43,25 @@ def quantise_network(
         source: float network.
         feeds: inputs that give the ranges of the activations.
         overrides: the network as it is quantised -> scales that calibration must not choose.
+        operators: whose inputs and outputs are rounded.
+        first: the first convolution of which that is true; those before it stay in float.
     """
     with tempfile.TemporaryDirectory() as folder:
         prepared, simulated = Path(folder) / "prepared.onnx", Path(folder) / "simulated.onnx"
         quant_pre_process(str(source), str(prepared), skip_symbolic_shape=True)
+        network = onnx.load(str(prepared))
+        convolutions = [node.name for node in network.graph.node if node.op_type == "Conv"]
         quantize_static(
             str(prepared),
             str(simulated),
             _Feeds(feeds),
-            op_types_to_quantize=list(QUANTISED),
+            op_types_to_quantize=list(operators),
             quant_format=QuantFormat.QDQ,
             per_channel=True,
             activation_type=QuantType.QUInt8,
             weight_type=QuantType.QInt8,
-            extra_options={"TensorQuantOverrides": overrides(onnx.load(str(prepared)))},
+            nodes_to_exclude=convolutions[:first],
+            extra_options={"TensorQuantOverrides": overrides(network) if overrides else {}},
         )
         return onnx.load(str(simulated))
 

@@ -34,7 +34,7 @@ from cvthead.training.renderers import OpenRenderer
 from cvthead.training.train import per_view, train
 
 FRAMES = 8
-STEPS = 1200
+STEPS = 1800
 DECIBELS = 30.0
 SAMPLES = 8
 
@@ -71,7 +71,7 @@ def test_one_clip_is_learnt_by_heart(tmp_path: Path, part: float) -> None:
         freeze_norm=0.6,
         average=0.99,
         augmentation=False,
-        losses=LossWeights(perceptual=0.5),
+        losses=LossWeights(perceptual=0.2),
         optimiser=Optimiser(
             name="adamw", learning_rate=1e-3, warm_up=20, schedule="late-cosine", clip_norm=1.0
         ),
