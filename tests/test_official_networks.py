@@ -22,6 +22,7 @@ from cvthead.model.splat import splat_clamped
 from cvthead.official.avatar import OfficialAvatar
 from cvthead.official.manifest import (
     DESCRIBE_INT8_ONNX,
+    DESCRIBE_ONNX,
     EIGHT_BIT,
     FILES,
     MIN_PSNR,
@@ -34,11 +35,11 @@ from cvthead.official.networks import Network, foreground
 from cvthead.official.painted import Painted
 from cvthead.official.pipeline import OfficialPipeline
 from cvthead.official.quantise import (
+    keep_if_close,
+    quantised_encoder,
     quantised_unet,
     sample_views,
     source_of,
-    write_encoder_if_close,
-    write_unet_if_close,
 )
 from cvthead.official.splat import splat
 from cvthead.runtime.sessions import open_session
@@ -99,13 +100,12 @@ def test_frame_rounds_and_over_white_truncates() -> None:
 
 
 def test_the_eight_bit_networks_paint_what_the_float_ones_do(
-    model: Path, pipeline: OfficialPipeline, avatar: OfficialAvatar
+    model: Path, pipeline: OfficialPipeline
 ) -> None:
     """And are served, with the made-up weights, unless they are not close enough."""
     served = OfficialPipeline.load(model)
     close = {
-        name: served.networks.manifest.psnr[small] >= MIN_PSNR[small]
-        for name, small in EIGHT_BIT.items()
+        name: served.networks.manifest.psnr[small] >= MIN_PSNR for name, small in EIGHT_BIT.items()
     }
     assert any(close.values())
     assert served.networks.precision == {
@@ -117,7 +117,7 @@ def test_the_eight_bit_networks_paint_what_the_float_ones_do(
         each.render(each.encode(read_image(PORTRAIT)), controls).rgba()
         for each in (served, pipeline)
     ]
-    assert psnr(*frames) > MIN_PSNR[UNET_INT8_ONNX] - 3
+    assert psnr(*frames) > MIN_PSNR - 3
     assert not np.array_equal(frames[0], frames[1])
 
 
@@ -149,9 +149,12 @@ def uneven(model: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_poor_eight_bit_unet_is_not_served(
     uneven: Path, pipeline: OfficialPipeline, avatar: OfficialAvatar
 ) -> None:
-    views = sample_views(pipeline, [read_image(PORTRAIT)], 3)
-    lowest = write_unet_if_close(uneven, views[:2], views[2:])
-    assert lowest < MIN_PSNR[UNET_INT8_ONNX]
+    portrait = read_image(PORTRAIT)
+    network = quantised_unet(uneven / UNET_ONNX, sample_views(pipeline, [portrait], 2))
+    exact = OfficialPipeline.load(uneven, precision="float32")
+    lowest, kept = keep_if_close(exact, exact, UNET_ONNX, network, [portrait])
+    assert lowest < MIN_PSNR
+    assert kept is exact
     write_manifest(uneven, (), {UNET_INT8_ONNX: lowest, DESCRIBE_INT8_ONNX: 0})
     record = Manifest.load(uneven)
     assert UNET_INT8_ONNX not in record.sha256
@@ -162,16 +165,17 @@ def test_a_poor_eight_bit_unet_is_not_served(
     assert psnr(*(frame.rgba() for frame in frames)) > 60
 
 
-def test_a_poor_eight_bit_encoder_is_not_served(uneven: Path, avatar: OfficialAvatar) -> None:
+def test_a_poor_eight_bit_encoder_is_not_served(
+    model: Path, pipeline: OfficialPipeline, avatar: OfficialAvatar
+) -> None:
     """One that was calibrated on a black picture has no range for a portrait."""
-    exact = OfficialPipeline.load(uneven, precision="float32")
     portrait = read_image(PORTRAIT)
-    black = {
-        name: np.zeros_like(value) for name, value in source_of(exact, portrait, avatar).items()
-    }
-    lowest = write_encoder_if_close(exact, [black], [portrait])
-    assert lowest < MIN_PSNR[DESCRIBE_INT8_ONNX]
-    assert not (uneven / DESCRIBE_INT8_ONNX).exists()
+    source = source_of(pipeline, portrait, avatar)
+    black = {name: np.zeros_like(value) for name, value in source.items()}
+    network = quantised_encoder(model / DESCRIBE_ONNX, [black])
+    lowest, kept = keep_if_close(pipeline, pipeline, DESCRIBE_ONNX, network, [portrait])
+    assert lowest < MIN_PSNR
+    assert kept is pipeline
 
 
 def test_the_last_layer_stays_in_float(pipeline: OfficialPipeline, model: Path) -> None:

@@ -75,6 +75,6 @@ def precisions(model: Manifest) -> str:
     for exact, small in EIGHT_BIT.items():
         served = f"it is served instead of {exact}"
         if small not in model.sha256:
-            served = f"{MIN_PSNR[small]:g} are wanted: {exact} is served"
+            served = f"{MIN_PSNR:g} are wanted: {exact} is served"
         lines.append(f"{small}: pictures {model.psnr[small]:.1f} dB from the float ones; {served}")
     return "\n".join(lines)

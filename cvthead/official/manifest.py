@@ -36,8 +36,7 @@ NETWORKS = (PARSING_ONNX, HAIR_ONNX, DECA_ONNX, DESCRIBE_ONNX, UNET_ONNX)
 FILES = (*WEIGHTS, *NETWORKS)
 # What is served instead of a float network, if its pictures are close enough.
 EIGHT_BIT = {UNET_ONNX: UNET_INT8_ONNX, DESCRIBE_ONNX: DESCRIBE_INT8_ONNX}
-# dB of those pictures to the float ones. The encoder's share of the error is to be small.
-MIN_PSNR = {UNET_INT8_ONNX: 40.0, DESCRIBE_INT8_ONNX: 46.0}
+MIN_PSNR = 40.0  # dB of those pictures to the float ones
 HINT = "import the official files again with `cvthead import-official`"
 FOLDER_VARIABLE = "CVTHEAD_OFFICIAL"
 WEIGHTS_PART = "CVTHead weights and tables (cvthead.pt, data/)"
@@ -100,8 +99,8 @@ class Manifest:
         fingerprint: 16 hex digits of all weights; avatars remember it.
         sources: the files it was made from.
         sha256: of each of FILES, and of the 8-bit ones that are there.
-        psnr: 8-bit file -> dB of the pictures made with it, and everything else in float, to the
-            float ones; also where that was too little.
+        psnr: 8-bit file -> dB of the pictures made with it, and with those before it that are
+            served, to the float ones; also where that was too little.
     """
 
     folder: Path

@@ -17,14 +17,12 @@ from cvthead.controls import Controls, resolve
 from cvthead.images import read_image
 from cvthead.official.avatar import OfficialAvatar
 from cvthead.official.manifest import (
-    DESCRIBE_INT8_ONNX,
     DESCRIBE_ONNX,
+    EIGHT_BIT,
     MIN_PSNR,
-    UNET_INT8_ONNX,
     UNET_ONNX,
 )
 from cvthead.official.networks import Network, picture_array
-from cvthead.official.painted import Painted
 from cvthead.official.pipeline import OfficialPipeline
 from cvthead.runtime.sessions import open_session
 from cvthead.runtime.threads import cores
@@ -39,16 +37,20 @@ from cvthead.training.static_int8 import (
     quantise_network,
 )
 
-CALIBRATION, HELD_OUT = 8, 4
 SEED = 5
 INPUT = "splat"
-LARGEST_TURN = np.array([0.3, 0.7, 0.3])  # radians
-LARGEST_JAW = 0.4
-POSES_EACH = 2
+VIEWS = 10  # to calibrate on
+POSES_EACH = 2  # to compare
+# Tilt in degrees, factor and addend of the values.
+SEEN = ((-8.0, 1.25, 0.0), (10.0, 0.75, -10.0), (0.0, 0.5, 100.0))
+UNSEEN = ((15.0, 0.6, 0.0), (-15.0, 0.7, 70.0))
+# The rare largest values may saturate: finer steps for all others are worth 1 dB.
+RANGE = 0.9
 # Convolutions up to the end of the first block: few channels, whose rounding costs 10 dB, and as
 # fast in float.
 ENCODER_FLOAT = 5
-ALTERATIONS = ((15.0, 0.6, 0.0), (-15.0, 0.7, 70.0))  # degrees, factor, addend of 0..255
+LARGEST_TURN = np.array([0.3, 0.7, 0.3])  # radians
+LARGEST_JAW = 0.4
 
 Array = NDArray[np.float32]
 Image = NDArray[np.uint8]
@@ -57,69 +59,68 @@ Image = NDArray[np.uint8]
 def quantise(folder: Path) -> dict[str, float]:
     """Write the 8-bit networks of an import beside the float ones, if they are close enough.
 
-    Calibrated on the sample portrait and its mirror image, compared in other poses and with
-    tilted, darkened and pale portraits.
+    Calibrated on the sample portrait and altered ones; compared on others, in other poses.
 
     Returns:
-        Lowest PSNR in dB of the pictures by file; the file is there if it is MIN_PSNR or more.
+        8-bit file -> lowest PSNR in dB of what it and those before it paint, to the float
+        networks' pictures. The file is there if that is MIN_PSNR or more.
     """
-    pipeline = OfficialPipeline.load(folder, precision="float32")
+    exact = OfficialPipeline.load(folder, precision="float32")
     portrait = read_image(SAMPLE)
-    known = portrait, np.ascontiguousarray(portrait[:, ::-1])
-    views = sample_views(pipeline, known, CALIBRATION + HELD_OUT)
-    unet = write_unet_if_close(folder, views[:CALIBRATION], views[CALIBRATION:])
-    sources = [source_of(pipeline, image, pipeline.encode(image)) for image in known]
-    encoder = write_encoder_if_close(pipeline, sources, altered(portrait))
-    return {UNET_INT8_ONNX: unet, DESCRIBE_INT8_ONNX: encoder}
+    known = [portrait, np.ascontiguousarray(portrait[:, ::-1]), *altered(portrait, SEEN)]
+    unseen = altered(portrait, UNSEEN)
+    unet = quantised_unet(folder / UNET_ONNX, sample_views(exact, known, VIEWS))
+    sources = [source_of(exact, image, exact.encode(image)) for image in known[:2]]
+    encoder = quantised_encoder(folder / DESCRIBE_ONNX, sources)
+    found, served = {}, exact
+    for name, network in ((UNET_ONNX, unet), (DESCRIBE_ONNX, encoder)):
+        found[EIGHT_BIT[name]], served = keep_if_close(exact, served, name, network, unseen)
+    return found
 
 
-def write_unet_if_close(
-    folder: Path, calibration: Sequence[Array], held_out: Sequence[Array]
-) -> float:
-    """The U-Net on given views (1, 256, 256, channels); dB of its frames to the float one's."""
-    data = quantised_unet(folder / UNET_ONNX, calibration).SerializeToString()
-    exact, small = (
-        Network(open_session(source, cores()), keeps_memory=True)
-        for source in (str(folder / UNET_ONNX), data)
-    )
-    lowest = min(
-        psnr(*(Painted(network(view)[0][0]).frame().rgba() for network in (exact, small)))
-        for view in held_out
-    )
-    if lowest >= MIN_PSNR[UNET_INT8_ONNX]:
-        (folder / UNET_INT8_ONNX).write_bytes(data)
-    return lowest
-
-
-def write_encoder_if_close(
-    pipeline: OfficialPipeline, calibration: Sequence[Feed], held_out: Sequence[Image]
-) -> float:
-    """The image encoder; dB of whole frames.
+def keep_if_close(
+    exact: OfficialPipeline,
+    served: OfficialPipeline,
+    name: str,
+    network: onnx.ModelProto,
+    portraits: Sequence[Image],
+) -> tuple[float, OfficialPipeline]:
+    """Serve an 8-bit network and write it, if the pictures stay close to the float ones.
 
     Args:
-        pipeline: in float32.
-        calibration: see :func:`source_of`.
-        held_out: portraits.
+        exact: in float32.
+        served: what has been accepted until now.
+        name: of the network that gives way.
+
+    Returns:
+        Lowest PSNR in dB; and what is served from now on.
     """
-    folder = pipeline.networks.manifest.folder
-    # The transformer behind the convolutions takes a thirtieth of the time and stays in float.
-    data = quantise_network(
-        folder / DESCRIBE_ONNX, calibration, operators=["Conv"], first=ENCODER_FLOAT
-    ).SerializeToString()
-    encoder = Network(open_session(data, cores()), keeps_memory=False)
+    data = network.SerializeToString()
+    part = Network(open_session(data, cores()), keeps_memory=name == UNET_ONNX)
+    networks = (
+        replace(served.networks, unet=part)
+        if name == UNET_ONNX
+        else replace(served.networks, describe=part)
+    )
+    tried = replace(served, networks=networks)
     random = np.random.default_rng(SEED)
     lowest = np.inf
-    for image in held_out:
-        exact = pipeline.encode(image)
-        (descriptors,) = encoder(*source_of(pipeline, image, exact).values())
-        avatars = exact, replace(exact, descriptors=descriptors[0])
+    for image in portraits:
+        avatars = exact.encode(image), tried.encode(image)
         for _ in range(POSES_EACH):
             controls = moved(random)
-            frames = (pipeline.render(avatar, controls).rgba() for avatar in avatars)
-            lowest = min(lowest, psnr(*frames))
-    if lowest >= MIN_PSNR[DESCRIBE_INT8_ONNX]:
-        (folder / DESCRIBE_INT8_ONNX).write_bytes(data)
-    return float(lowest)
+            frames = exact.render(avatars[0], controls), tried.render(avatars[1], controls)
+            lowest = min(lowest, psnr(*(frame.rgba() for frame in frames)))
+    if lowest < MIN_PSNR:
+        return float(lowest), served
+    (exact.networks.manifest.folder / EIGHT_BIT[name]).write_bytes(data)
+    return float(lowest), tried
+
+
+def quantised_encoder(source: Path, feeds: Sequence[Feed]) -> onnx.ModelProto:
+    """The 8-bit image encoder of a float one, with ranges from :func:`source_of`."""
+    # The transformer behind the convolutions takes a thirtieth of the time and stays in float.
+    return quantise_network(source, feeds, operators=["Conv"], first=ENCODER_FLOAT)
 
 
 def quantised_unet(source: Path, views: Sequence[Array]) -> onnx.ModelProto:
@@ -133,7 +134,8 @@ def _overrides(network: onnx.ModelProto, feeds: Sequence[Feed]) -> Overrides:
     highest = largest(network, sorted({name for group in groups for name in group}), feeds)
     overrides: Overrides = {}
     for group in groups:
-        overrides |= dict.fromkeys(group, override(max(highest[n] for n in group) / 255, 0))
+        scale = RANGE * max(highest[n] for n in group) / 255
+        overrides |= dict.fromkeys(group, override(scale, 0))
     return overrides
 
 
@@ -157,14 +159,14 @@ def source_of(pipeline: OfficialPipeline, image: Image, avatar: OfficialAvatar) 
     return {"source": source, "points": points[None]}
 
 
-def altered(portrait: Image) -> list[Image]:
-    """A portrait tilted and darkened; and tilted the other way, pale."""
+def altered(portrait: Image, alterations: Sequence[tuple[float, float, float]]) -> list[Image]:
+    """A portrait tilted (degrees) and its values times a factor plus an addend (0..255)."""
     height, width = portrait.shape[:2]
     images = []
-    for tilt, gain, shift in ALTERATIONS:
+    for tilt, factor, addend in alterations:
         turn = cv2.getRotationMatrix2D((width / 2, height / 2), tilt, 1)
         tilted = cv2.warpAffine(portrait, turn, (width, height), borderMode=cv2.BORDER_REPLICATE)
-        changed = cv2.convertScaleAbs(tilted, alpha=gain, beta=shift)
+        changed = cv2.convertScaleAbs(tilted, alpha=factor, beta=addend)
         images.append(np.asarray(changed, np.uint8))
     return images
 
