@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from cvthead.avatar import Avatar
+from cvthead.cli.bench import table
 from cvthead.cli.main import main
 from cvthead.images import encode_image, read_image
 from cvthead.provenance import SourceType, read_mark
@@ -20,6 +21,7 @@ from cvthead.video import probe_video, read_frames
 from cvthead.video_writer import video_writer
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
+BENCHMARK = Path(__file__).parents[1] / "docs" / "benchmark.md"
 PORTRAIT = EXAMPLES / "astronaut.png"
 
 
@@ -234,6 +236,15 @@ def test_render_backgrounds_and_sizes(avatar: Path, tmp_path: Path) -> None:
     assert np.abs(clear - read_image(tmp_path / "large.png")).mean() < 1
 
 
+def test_render_names_the_preset_of_another_avatar(
+    avatar: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "out.png"
+    assert main(["render", str(avatar), "--preset", "open", "-o", str(path)]) == 0
+    assert main(["render", str(avatar), "--preset", "official", "-o", str(path)]) == 2
+    assert "use --preset open" in capsys.readouterr().err
+
+
 def test_render_forms_of_coefficients_agree(avatar: Path, tmp_path: Path) -> None:
     expression = Avatar.load(avatar).coefficients.expression.tolist()
     expression[3] = -1.5
@@ -357,20 +368,18 @@ def test_sweep_cells_differ(avatar: Path, tmp_path: Path) -> None:
 
 
 def test_bench_names_every_stage(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["bench", str(PORTRAIT), "--renders", "2"]) == 0
-    printed = capsys.readouterr().out
-    for stage in (
-        "track",
-        "mask",
-        "deformation",
-        "describe",
-        "pose",
-        "splat and warp",
-        "U-Net",
-        "composite",
-        "JPEG to JPEG",
-    ):
-        assert f"\n{stage}" in printed
+    """In the keys that docs/benchmark.md lists, and in the table."""
+    assert main(["bench", str(PORTRAIT), "--renders", "2", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    documented = BENCHMARK.read_text("utf-8").partition("| `preset` |")[2].partition("\n\n")[0]
+    assert set(report) == {"preset", "threads", "encode", "render", "drive", "torch", "ratios"}
+    printed = table(report)
+    for part in ("encode", "render", "drive"):
+        (line,) = (row for row in documented.splitlines() if row.startswith(f"| `{part}` |"))
+        for stage, times in report[part].items():
+            assert f"`{stage}`" in line
+            assert f"\n{stage}" in printed
+            assert 0 < times["median_ms"] <= times["p95_ms"]
 
 
 def test_process_status_and_streams(tmp_path: Path) -> None:

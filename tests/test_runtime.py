@@ -141,6 +141,13 @@ def test_altered_or_missing_files_are_refused(tmp_path: Path) -> None:
             Networks.load(folder)
 
 
-def test_rendering_needs_no_torch() -> None:
-    code = "import sys, cvthead.cli.main, cvthead.pipeline; sys.exit('torch' in sys.modules)"
+def test_the_service_and_rendering_need_no_torch() -> None:
+    code = """
+import sys
+import cvthead.cli.main, service.app
+from cvthead.pipeline import Pipeline
+from service.warmup import warm_up
+warm_up(Pipeline.load(threads=1))
+sys.exit("torch" in sys.modules)
+"""
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -20,7 +20,7 @@ from cvthead.cli.main import main
 from cvthead.deformation import DeformationModel
 from cvthead.errors import AssetError, InputError
 from cvthead.head.model import HeadModel
-from cvthead.points import PointLayout
+from cvthead.points import FAR_AWAY, PointLayout
 from cvthead.source import read_source
 from cvthead.tracking.tracker import Tracker
 from cvthead.training import records
@@ -129,6 +129,21 @@ def test_without_deformation_no_shell_is_drawn(
     assert torch.equal(haired["image"], bald["image"])
 
 
+def test_the_paper_draws_what_the_portrait_cuts_off(
+    folder: Path, head: HeadModel, layout: PointLayout
+) -> None:
+    cut, whole = (
+        PairDataset(folder, head, layout, size=64, seed=1, samples=4, augment=False, whole=whole)[
+            0
+        ]["driven"][0, : layout.vertices]
+        for whole in (False, True)
+    )
+    away = (cut == torch.from_numpy(FAR_AWAY)).all(dim=1)
+    assert away.any()
+    assert whole.abs().max() < 3
+    assert torch.equal(whole[~away], cut[~away])
+
+
 def test_the_mirror_image_of_a_still_carries_no_hair_across_the_face(
     folder: Path, head: HeadModel, layout: PointLayout
 ) -> None:
@@ -233,8 +248,13 @@ def test_shipped_configurations_are_valid() -> None:
     assert fine.init == "shipped"
     assert fine.data == Path("d")
     assert load_config("open.toml", {}).optimiser.betas == (0.9, 0.99)
-    assert load_config("paper", {}).batch == 16
-    assert load_config("paper-stage2", {}).stage == 2
+    for name, stage, adversarial in (("paper", 1, 0), ("paper-stage2", 2, 0.1)):
+        paper = load_config(name, {})
+        assert (paper.preset, paper.batch, paper.stage) == ("paper", 16, stage)
+        assert (paper.optimiser.name, paper.optimiser.learning_rate) == ("adam", 1e-4)
+        weights = paper.losses
+        assert (weights.l1, weights.perceptual, weights.dice, weights.identity) == (1, 1, 1, 0.1)
+        assert weights.adversarial == adversarial
 
 
 def test_single_keys_are_set_from_the_command_line() -> None:

@@ -43,6 +43,13 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         action="store_true",
         help="an earlier import in that folder gives way once the new one is complete",
     )
+    parser.add_argument(
+        "--precision",
+        choices=("int8", "float32"),
+        default="int8",
+        help="int8 (default) serves U-Net and image encoder in 8 bits where their pictures are "
+        "close enough to the float ones; float32 serves everything as released",
+    )
     parser.set_defaults(run=run)
 
 
@@ -60,7 +67,8 @@ def run(args: argparse.Namespace) -> None:
     if args.output is None:
         with write_errors(output):
             output.parent.mkdir(parents=True, exist_ok=True)
-    for source in import_official(args.folder, output, replace=args.replace):
+    eight_bit = args.precision == "int8"
+    for source in import_official(args.folder, output, replace=args.replace, eight_bit=eight_bit):
         print(f"{source.name}: {', '.join(source.used_for)}")
     print(f"\n{precisions(Manifest.load(output))}")
     print("\nLicences of what was imported; none of it is part of cvthead:")
@@ -71,6 +79,8 @@ def run(args: argparse.Namespace) -> None:
 
 def precisions(model: Manifest) -> str:
     """Which networks of an import are served in 8 bits, and why."""
+    if not model.psnr:
+        return "everything is served in float32"
     lines = []
     for exact, small in EIGHT_BIT.items():
         served = f"it is served instead of {exact}"

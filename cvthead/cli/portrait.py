@@ -8,7 +8,7 @@ from typing import Any
 
 from cvthead.errors import InputError
 from cvthead.images import read_image
-from cvthead.preset import PRESETS, Preset, load_avatar
+from cvthead.preset import PRESETS, AnyAvatar, Preset, load_avatar
 
 
 def add_portrait_options(parser: argparse.ArgumentParser, name: str, what: str) -> None:
@@ -19,12 +19,14 @@ def add_portrait_options(parser: argparse.ArgumentParser, name: str, what: str) 
     add_preset_option(parser)
 
 
-def add_preset_option(parser: argparse.ArgumentParser) -> None:
+def add_preset_option(
+    parser: argparse.ArgumentParser, *, default: str | None = "open", shown: str = "open"
+) -> None:
     parser.add_argument(
         "--preset",
         type=preset,
-        default="open",
-        help="model to use: open (default), or official after `cvthead import-official`",
+        default=default,
+        help=f"model to use, open or official after `cvthead import-official` (default: {shown})",
     )
 
 
@@ -57,8 +59,13 @@ def read_avatar(pipeline: Preset[Any], path: Path, face: int | None) -> Any:
     if path.suffix.lower() != ".avatar":
         return pipeline.encode(read_image(path), face=face)
     avatar = load_avatar(path)
-    if avatar.preset != pipeline.preset:
+    check_preset(path, avatar, pipeline.preset)
+    return avatar
+
+
+def check_preset(path: Path, avatar: AnyAvatar, preset: str) -> None:
+    """Refuse the avatar of a file unless it is of a preset."""
+    if avatar.preset != preset:
         raise InputError(
             f"{path} is of the preset {avatar.preset}", hint=f"use --preset {avatar.preset}"
         )
-    return avatar

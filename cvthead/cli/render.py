@@ -16,7 +16,7 @@ from cvthead.cli.picture import (
     check_size,
     write_picture,
 )
-from cvthead.cli.portrait import add_model_option
+from cvthead.cli.portrait import add_model_option, add_preset_option, check_preset
 from cvthead.cli.values import vector, weights
 from cvthead.coefficients import Coefficients
 from cvthead.composite import Composer
@@ -63,6 +63,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         default="absolute",
         help="values replace the portrait's (absolute, the default) or are added to them",
     )
+    add_preset_option(parser, default=None, shown="the avatar's")
     add_model_option(parser)
     add_picture_options(parser)
     parser.set_defaults(run=run)
@@ -72,6 +73,8 @@ def run(args: argparse.Namespace) -> None:
     check_output(args.output, tuple(IMAGE_FORMATS), alpha=args.background == "transparent")
     check_size(args.size)
     avatar = load_avatar(args.avatar)
+    if args.preset:
+        check_preset(args.avatar, avatar, args.preset)
     controls = controls_of(args, avatar.coefficients)
     pipeline = load_preset(avatar.preset, model=args.model)
     composer = Composer.of(args.background, args.size, pipeline.background(avatar))

@@ -151,7 +151,9 @@ class _Folder:
         )
 
 
-def import_official(source: Path, output: Path, *, replace: bool = False) -> tuple[SourceFile, ...]:
+def import_official(
+    source: Path, output: Path, *, replace: bool = False, eight_bit: bool = True
+) -> tuple[SourceFile, ...]:
     """Convert the released files.
 
     Args:
@@ -160,6 +162,7 @@ def import_official(source: Path, output: Path, *, replace: bool = False) -> tup
         output: new folder for safetensors and ONNX files and ``model.json``.
         replace: an earlier import in ``output`` gives way once the new one is complete; until
             then, and if anything fails, it stays as it was.
+        eight_bit: False leaves out the 8-bit networks: everything is served in float32.
 
     Returns:
         The files that were used.
@@ -178,8 +181,8 @@ def import_official(source: Path, output: Path, *, replace: bool = False) -> tup
     new = atomic_path(output.resolve(), folder=True, replace=replace)
     with new as temporary, write_errors(output):
         write_model(temporary, files, sources)
-        # It is calibrated on what the float networks paint.
-        write_manifest(temporary, sources, quantise(temporary))
+        if eight_bit:  # calibrated on what the float networks paint
+            write_manifest(temporary, sources, quantise(temporary))
     return sources
 
 

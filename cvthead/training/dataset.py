@@ -74,6 +74,7 @@ class PairDataset(Dataset[dict[str, Tensor]]):
         deform: bool = True,
         augment: bool = True,
         labels: Path | None = None,
+        whole: bool = False,
     ) -> None:
         """Args:
         folder: records of cvthead.data, see cvthead.training.records.
@@ -82,11 +83,12 @@ class PairDataset(Dataset[dict[str, Tensor]]):
         deform: False leaves the heads bald: the ablation without deformation.
         augment: False takes pictures as they are, neither mirrored nor recoloured nor zoomed.
         labels: table of the stills' groups, see cvthead.training.sampling.
+        whole: True draws the points that the portrait cuts off as well, as the paper does.
 
         Raises:
             InputError: no records in the folder, or no table of labels.
         """
-        self.deform, self.augment = deform, augment
+        self.deform, self.augment, self.whole = deform, augment, whole
         self.head, self.layout = head, layout
         self.size, self.seed, self.samples = size, seed, samples
         stored = stored_records(folder)
@@ -145,6 +147,8 @@ class PairDataset(Dataset[dict[str, Tensor]]):
             drawn = flip_order(drawn.astype(np.float32), self.layout) > 0
             anchor = self.head.mirror[anchor].astype(np.int64)
             views = [mirrored(v, self.layout) for v in views]
+        if self.whole:
+            drawn = np.ones_like(drawn)
         driven = [np.where(drawn[:, None], v.points, FAR_AWAY) for v in views]
         landmarks = [self.head.landmarks(v.points[: self.layout.vertices]) for v in views]
         at = places(self.layout, own, visible > 0)

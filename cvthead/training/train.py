@@ -70,6 +70,7 @@ def train(config: TrainConfig, *, sitting: int | None = None) -> Path:
         deform=config.deformation,
         labels=config.labels,
         augment=config.augmentation,
+        whole=config.preset == "paper",
     )
     objective = Objective(config).to(fabric.device)
     renderer = build_renderer(config, layout)
