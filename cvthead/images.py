@@ -144,7 +144,9 @@ def encode_image(
             return mark_png(encode_png(image), source)
         out = BytesIO()
         picture = Image.fromarray(on_white(image) if image_format == "jpeg" else image)
-        picture.save(out, image_format.upper(), quality=quality, xmp=xmp_packet(source))
+        # WebP's default method takes five times as long for a fifth fewer bytes.
+        fast = {"method": 0} if image_format == "webp" else {}
+        picture.save(out, image_format.upper(), quality=quality, xmp=xmp_packet(source), **fast)
         return out.getvalue()
     except (OSError, ValueError, KeyError) as error:
         raise ImageError(
