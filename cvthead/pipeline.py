@@ -62,6 +62,7 @@ class Pipeline:
         model: Path | None = None,
         threads: int | None = None,
         providers: Sequence[str] = CPU,
+        encode_niceness: int = 0,
     ) -> Pipeline:
         """Load head, tracker and trained networks.
 
@@ -72,13 +73,19 @@ class Pipeline:
             threads: of the trained networks; None takes the machine's cores, at most 4.
             providers: of the trained networks, see cvthead.runtime.sessions; the tracker's run
                 on the CPU.
+            encode_niceness: as cvthead.preset.load_preset has it.
 
         Raises:
             AssetError: an unknown preset or provider, or a missing or altered file.
         """
         if preset != "open":
             raise AssetError(f"unknown preset {preset!r}", hint="use the preset 'open'")
-        networks = Networks.load(model or packaged(preset), threads=threads, providers=providers)
+        networks = Networks.load(
+            model or packaged(preset),
+            threads=threads,
+            providers=providers,
+            encode_niceness=encode_niceness,
+        )
         head = HeadModel.load()
         return cls(
             head,

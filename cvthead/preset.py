@@ -107,6 +107,7 @@ def load_preset(
     model: Path | None = None,
     threads: int | None = None,
     providers: Sequence[str] = CPU,
+    encode_niceness: int = 0,
 ) -> Preset[Any]:
     """The models of a preset.
 
@@ -116,14 +117,23 @@ def load_preset(
             than the default one.
         threads: of the networks; None takes the machine's cores.
         providers: of the networks, see cvthead.runtime.sessions; the face tracker's run on the CPU.
+        encode_niceness: lowers the priority of the threads that only encoding needs (Linux).
 
     Raises:
         AssetError: an unknown preset or provider, or a missing or altered file; for "official":
             nothing was imported.
     """
     if name != "official":
-        return Pipeline.load(name, model=model, threads=threads, providers=providers)
-    return OfficialPipeline.load(model, threads=threads, providers=providers)
+        return Pipeline.load(
+            name,
+            model=model,
+            threads=threads,
+            providers=providers,
+            encode_niceness=encode_niceness,
+        )
+    return OfficialPipeline.load(
+        model, threads=threads, providers=providers, encode_niceness=encode_niceness
+    )
 
 
 def load_avatar(path: Path) -> Avatar | OfficialAvatar:

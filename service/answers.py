@@ -3,28 +3,51 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from typing import Self
+from typing import Annotated, Self
 
 from pydantic import BaseModel, Field
 
 from cvthead.camera import Camera
-from cvthead.coefficients import JOINTS, Array, Coefficients
+from cvthead.coefficients import EXPRESSION_SIZE, JOINTS, SHAPE_SIZE, Array, Coefficients
 from cvthead.preset import AnyAvatar
 from cvthead.record import AvatarRecord
 from cvthead.tracking.tracker import TrackedFace
 
 EXAMPLE_ID = "5f2b8c0d9e4a47f1a6b3c2d1e0f98765"
+EXAMPLE_CURSOR = f"1772366400.123456-{EXAMPLE_ID}"
 VECTOR = [[0.0, 0.1, 0.0]]
+BOX = [[171.2, 64.8, 296.1, 230.4]]
+
+Rotation = Annotated[list[float], Field(min_length=3, max_length=3)]
+FaceBox = Annotated[list[float], Field(min_length=4, max_length=4)]
+Shape = Annotated[
+    list[float],
+    Field(
+        min_length=SHAPE_SIZE,
+        max_length=SHAPE_SIZE,
+        description="Identity: 100 coefficients in standard deviations.",
+        examples=[[0.5] + [0.0] * (SHAPE_SIZE - 1)],
+    ),
+]
+Expression = Annotated[
+    list[float],
+    Field(
+        min_length=EXPRESSION_SIZE,
+        max_length=EXPRESSION_SIZE,
+        description="Expression: 50 coefficients in standard deviations.",
+        examples=[[1.5] + [0.0] * (EXPRESSION_SIZE - 1)],
+    ),
+]
 
 
 class Pose(BaseModel):
     """Rotations as axis-angle in radians, as `PoseControls` has them."""
 
-    global_: list[float] = Field(alias="global", description="Of the whole head.", examples=VECTOR)
-    neck: list[float] = Field(description="Of the head on the neck.", examples=VECTOR)
-    jaw: list[float] = Field(description="Of the jaw.", examples=VECTOR)
-    left_eye: list[float] = Field(description="Of the subject's left eye.", examples=VECTOR)
-    right_eye: list[float] = Field(description="Of the subject's right eye.", examples=VECTOR)
+    global_: Rotation = Field(alias="global", description="Of the whole head.", examples=VECTOR)
+    neck: Rotation = Field(description="Of the head on the neck.", examples=VECTOR)
+    jaw: Rotation = Field(description="Of the jaw.", examples=VECTOR)
+    left_eye: Rotation = Field(description="Of the subject's left eye.", examples=VECTOR)
+    right_eye: Rotation = Field(description="Of the subject's right eye.", examples=VECTOR)
 
     @classmethod
     def of(cls, coefficients: Coefficients) -> Self:
@@ -46,8 +69,8 @@ class CameraInfo(BaseModel):
 class SourceInfo(BaseModel):
     """Coefficients of the portrait: where `relative` starts and what missing values keep."""
 
-    shape: list[float] = Field(description="100 identity coefficients, standard deviations.")
-    expression: list[float] = Field(description="50 expression coefficients, standard deviations.")
+    shape: Shape
+    expression: Expression
     pose: Pose
     camera: CameraInfo = Field(description="In the picture's coordinates, -1 to 1.")
 
@@ -87,15 +110,15 @@ class AvatarSummary(BaseModel):
     expires: datetime | None = Field(
         description="UTC; then it answers 410. Null: never.", examples=["2026-03-08T12:00:00Z"]
     )
-    bytes: int = Field(description="Size in the store.", examples=[612345])
+    bytes: int = Field(description="Size in the store.", ge=0, examples=[612345])
     preset: str = Field(description="Model that made it.", examples=["open"])
     fingerprint: str = Field(
         description="Of the trained weights; with others loaded it answers 409.",
         examples=["0123456789abcdef"],
     )
-    face_box: list[float] | None = Field(
+    face_box: FaceBox | None = Field(
         description="Left, top, right, bottom of the face in pixels of the portrait.",
-        examples=[[171.2, 64.8, 296.1, 230.4]],
+        examples=BOX,
     )
     links: Links
 
@@ -130,34 +153,43 @@ class AvatarPage(BaseModel):
 
     items: list[AvatarSummary] = Field(description="At most `limit`.")
     next: str | None = Field(
-        description="`cursor` of the next page; null on the last.", examples=[None]
+        description="`cursor` of the next page; null on the last.",
+        max_length=100,
+        examples=[EXAMPLE_CURSOR, None],
     )
 
 
 class TrackAnswer(BaseModel):
     """The measured face. `expression` and `pose` can be sent to `render` and to a stream."""
 
-    shape: list[float] = Field(description="100 identity coefficients, standard deviations.")
-    expression: list[float] = Field(description="50 expression coefficients, standard deviations.")
+    shape: Shape
+    expression: Expression
     pose: Pose
     camera: CameraInfo = Field(description="In pixels of the picture.")
     arkit: dict[str, float] | None = Field(
         description="ARKit blendshapes, 0 to 1 (all but `tongueOut`), if asked for.",
         examples=[{"jawOpen": 0.31}],
     )
-    box: list[float] = Field(
+    box: FaceBox = Field(
         description="Left, top, right, bottom of the face in pixels.",
-        examples=[[171.2, 64.8, 296.1, 230.4]],
+        examples=BOX,
     )
     yaw: float = Field(
         description="Degrees that the head is turned to its left; beyond 60 the fit is uncertain.",
+        ge=-180,
+        le=180,
         examples=[-4.2],
     )
     error: float = Field(
-        description="Mean landmark error in percent of the outer-eye distance.", examples=[2.4]
+        description="Mean landmark error in percent of the outer-eye distance.",
+        ge=0,
+        examples=[2.4],
     )
     presence: float = Field(
-        description="The network's belief that this is a face, 0.5 to 1.", examples=[0.99]
+        description="The network's belief that this is a face, 0.5 to 1.",
+        ge=0.5,
+        le=1,
+        examples=[0.99],
     )
 
     @classmethod

@@ -26,6 +26,8 @@ from service.signing import StillSigner
 from service.state import Service
 from service.warmup import warm_up
 
+# Renders go first, also on a machine that has no core to spare.
+ENCODE_NICENESS = 10
 DESCRIPTION = """\
 Upload a portrait, get an id, render it under any expression, pose and camera.
 
@@ -72,6 +74,7 @@ def build(settings: Settings) -> Service:
         model=settings.model,
         threads=settings.threads or None,
         providers=settings.providers or CPU,
+        encode_niceness=ENCODE_NICENESS,
     )
     warm_up(pipeline)
     metrics = Metrics()
@@ -94,6 +97,7 @@ def build(settings: Settings) -> Service:
         encode_queue=settings.encode_queue,
         render_queue=settings.render_queue,
         max_batch=settings.max_batch,
+        encode_niceness=ENCODE_NICENESS,
     )
     return Service(
         settings,

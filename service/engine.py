@@ -32,7 +32,6 @@ from service.worker import Item, Worker
 
 # Pictures decoded at once. Each takes up to 150 MB (cvthead.images.MAX_PIXELS).
 DECODERS = 2
-ENCODE_NICENESS = 10
 NO_BACKGROUND = np.zeros((1, 1, 3), np.uint8)
 MEDIA_TYPES = {
     "png": "image/png",
@@ -112,6 +111,8 @@ class Engine:
     Args:
         encode_queue, render_queue: jobs that may wait.
         max_batch: renders painted at once.
+        encode_niceness: lowers the priority of encoding; the pipeline's own threads have theirs
+            from when it was loaded.
 
     All methods raise Problem ``overloaded`` (with Retry-After) when their queue is full and
     ``draining`` once the engine stops, beside what their core function raises. A cancelled call
@@ -126,12 +127,13 @@ class Engine:
         encode_queue: int,
         render_queue: int,
         max_batch: int,
+        encode_niceness: int = 0,
     ) -> None:
         self.pipeline = pipeline
         self.max_batch = max_batch
         self._metrics = metrics
         self._encoding = Worker(
-            "encode", encode_queue, self._encode, metrics, niceness=ENCODE_NICENESS
+            "encode", encode_queue, self._encode, metrics, niceness=encode_niceness
         )
         self._rendering = Worker(
             "render",

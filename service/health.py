@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 import secrets
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Depends, Request, Response
+from fastapi.security import HTTPBearer
 from pydantic import BaseModel, Field
 
 from service.keys import authenticated
@@ -66,7 +67,11 @@ def writable(folder: Path) -> bool:
         **responses("unauthorized"),
     },
 )
-async def metrics(request: Request, service: ServiceDep) -> Response:
+async def metrics(
+    request: Request,
+    service: ServiceDep,
+    _: Annotated[object, Depends(HTTPBearer(auto_error=False))],
+) -> Response:
     """Needs a key when keys are set, unless `metrics_public` is."""
     if not service.settings.metrics_public:
         await authenticated(request)

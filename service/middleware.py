@@ -22,6 +22,7 @@ from starlette.websockets import WebSocket
 
 from service.keys import origin_allowed
 from service.problems import Problem
+from service.protocol import BROKEN_BODY
 from service.settings import Settings
 from service.state import Service, get_service
 
@@ -53,7 +54,15 @@ def install(app: FastAPI, settings: Settings) -> None:
             allow_origins=settings.cors_origins,
             allow_methods=["GET", "POST", "DELETE"],
             allow_headers=["Authorization", "Content-Type", "Idempotency-Key", "If-None-Match"],
-            expose_headers=["ETag", "Location", "Retry-After", "Server-Timing", "X-Request-ID"],
+            expose_headers=[
+                "ETag",
+                "Idempotency-Replayed",
+                "Location",
+                "Retry-After",
+                "Server-Timing",
+                "X-Digital-Source-Type",
+                "X-Request-ID",
+            ],
         )
 
 
@@ -207,7 +216,8 @@ class Gate:
 
 class BodyLimit:
     """Refuses bodies over a size: declared ones at once, others as soon as they exceed it. And
-    bodies that take too long to arrive, counted from when the application begins to read."""
+    bodies that take too long to arrive, counted from when the application begins to read; and
+    those that the protocol could not read on."""
 
     def __init__(self, app: ASGIApp, max_bytes: int, seconds: float) -> None:
         self.app = app
@@ -243,6 +253,12 @@ class BodyLimit:
             except TimeoutError:
                 headers = {"Connection": "close"}
                 raise Problem("request_timeout", headers=headers) from None
+            if scope["state"].get(BROKEN_BODY):
+                raise Problem(
+                    "malformed_body",
+                    "the chunks of the body are not as HTTP/1.1 has them",
+                    headers={"Connection": "close"},
+                )
             more = message.get("more_body", False)
             received += len(message.get("body", b""))
             if received > self.max_bytes:

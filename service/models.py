@@ -20,12 +20,24 @@ router = APIRouter()
 class Licences(BaseModel):
     """SPDX identifiers where there is one; NOTICE and docs/official.md have the sources."""
 
-    code: str = Field(default="Apache-2.0", description="Of the software.")
-    weights: str = Field(default="Apache-2.0", description="Of the trained weights.")
-    head: str = Field(default="CC0-1.0", description="Of the head model (MakeHuman, or FLAME).")
-    networks: str = Field(default="Apache-2.0", description="Of the face networks (MediaPipe).")
+    code: str = Field(default="Apache-2.0", description="Of the software.", examples=["Apache-2.0"])
+    weights: str = Field(
+        default="Apache-2.0", description="Of the trained weights.", examples=["Apache-2.0"]
+    )
+    head: str = Field(
+        default="CC0-1.0",
+        description="Of the head model (MakeHuman, or FLAME).",
+        examples=["CC0-1.0"],
+    )
+    networks: str = Field(
+        default="Apache-2.0",
+        description="Of the face networks (MediaPipe).",
+        examples=["Apache-2.0"],
+    )
     imported: dict[str, str] = Field(
-        default={}, description="Of the parts that the official preset was imported from."
+        default={},
+        description="Of the parts that the official preset was imported from.",
+        examples=[{licence.part: licence.licence for licence in LICENCES}, {}],
     )
 
     @classmethod
@@ -49,11 +61,23 @@ class ModelInfo(BaseModel):
         examples=["0123456789abcdef"],
     )
     version: str = Field(description="Of the software.", examples=["0.1.0"])
-    frame_size: int = Field(description="Side of a frame as it is rendered, in pixels.")
-    shape: int = Field(description="Number of shape coefficients.")
-    expression: int = Field(description="Number of expression coefficients.")
-    pose: list[str] = Field(description="Joints; each is an axis-angle of 3 numbers, radians.")
-    arkit: list[str] = Field(description="Blendshape names that `arkit` takes, each 0 to 1.")
+    frame_size: int = Field(
+        description="Side of a frame as it is rendered, in pixels.", ge=1, examples=[CROP_PIXELS]
+    )
+    shape: int = Field(description="Number of shape coefficients.", ge=1, examples=[SHAPE_SIZE])
+    expression: int = Field(
+        description="Number of expression coefficients.", ge=1, examples=[EXPRESSION_SIZE]
+    )
+    pose: list[str] = Field(
+        description="Joints; each is an axis-angle of 3 numbers, radians.",
+        min_length=1,
+        examples=[list(JOINTS)],
+    )
+    arkit: list[str] = Field(
+        description="Blendshape names that `arkit` takes, each 0 to 1.",
+        min_length=1,
+        examples=[list(ARKIT_NAMES)],
+    )
     licences: Licences
 
 

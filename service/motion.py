@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 from dataclasses import replace
 
@@ -48,9 +49,13 @@ class Motion:
         if message.kind is Kind.COEFFICIENTS:
             return controls_of(unpack_coefficients(message.payload), self._hello)
         face = await self._face(message)
+        # A thread: head model and crop take the event loop too long. Numbers, above, do not.
+        return await asyncio.to_thread(self._driven, face, message.kind)
+
+    def _driven(self, face: TrackedFace, kind: Kind) -> Pose:
         head = self._engine.pipeline.head
         # Without a reference frame the first one serves.
-        if self._reference is None or message.kind is Kind.REFERENCE:
+        if self._reference is None or kind is Kind.REFERENCE:
             self._reference = face
             if self._hello.camera == "driver":
                 self._crop = head_crop(head, face.coefficients, face.camera)

@@ -34,6 +34,7 @@ UPLOAD = (
     "invalid_image",
     "no_face",
     "face_turned_away",
+    "face_error",
     "overloaded",
 )
 HEADERS: dict[str, Any] = {

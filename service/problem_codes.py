@@ -20,7 +20,8 @@ PROBLEMS: Mapping[str, Kind] = {
     "malformed_request": Kind(
         400,
         "Not HTTP",
-        "The request line or the headers are not HTTP/1.1.",
+        "The request line or the headers are not HTTP/1.1, or a WebSocket's handshake is not as "
+        "RFC 6455 has it.",
         "Let an HTTP library write the request.",
     ),
     "invalid_json": Kind(
@@ -29,7 +30,8 @@ PROBLEMS: Mapping[str, Kind] = {
     "malformed_body": Kind(
         400,
         "Body cannot be read",
-        "The body is not what its Content-Type says, for example broken multipart.",
+        "The body is not what its Content-Type says, for example broken multipart; or its chunks "
+        "are not HTTP/1.1.",
         "Let an HTTP library write the body.",
     ),
     "unauthorized": Kind(

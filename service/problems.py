@@ -14,6 +14,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.exceptions import HTTPException
 from starlette.requests import HTTPConnection
 from starlette.responses import Response
+from starlette.routing import Match
+from starlette.types import Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketState
 
 from cvthead.errors import CVTHeadError, SeveralFacesError
@@ -22,6 +24,7 @@ from service.problem_codes import PROBLEMS
 MEDIA_TYPE = "application/problem+json"
 # Their messages name files of the server, which concern its operator only.
 OPERATORS = ("invalid_avatar_file", "store_full")
+METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE")
 MAX_ERRORS = 20  # listed in one answer
 POLICY_VIOLATION = 1008  # RFC 6455, for a stream that is already open
 # For OpenAPI; the schema is added in service/app.py.
@@ -166,6 +169,22 @@ def from_http(error: HTTPException) -> Problem:
     return Problem(code, headers=error.headers)
 
 
+def methods_of(connection: HTTPConnection) -> list[str]:
+    """All methods of the path. The framework names only those of the first route that has it."""
+    routes = connection.app.routes
+    asked = {method: {**connection.scope, "method": method} for method in METHODS}
+    return [
+        method
+        for method, scope in asked.items()
+        if any(route.matches(scope)[0] is Match.FULL for route in routes)
+    ]
+
+
+async def nowhere(scope: Scope, receive: Receive, send: Send) -> None:
+    """Answers where no route does; the framework would refuse a WebSocket with an empty 403."""
+    raise Problem("not_found")
+
+
 def install(app: FastAPI) -> None:
     """Let every error be answered as a problem. Unexpected ones are the middleware's."""
 
@@ -180,8 +199,12 @@ def install(app: FastAPI) -> None:
 
     async def http(connection: HTTPConnection, error: Exception) -> Response | None:
         assert isinstance(error, HTTPException)
-        return await _answer(connection, from_http(error))
+        problem = from_http(error)
+        if problem.code == "method_not_allowed":
+            problem.headers = {"Allow": ", ".join(methods_of(connection))}
+        return await _answer(connection, problem)
 
+    app.router.default = nowhere
     app.add_exception_handler(CVTHeadError, core)  # type: ignore[arg-type]
     app.add_exception_handler(RequestValidationError, validation)  # type: ignore[arg-type]
     app.add_exception_handler(HTTPException, http)  # type: ignore[arg-type]

@@ -15,6 +15,8 @@ from service.problems import Problem
 from service.settings import Settings
 
 MAX_HEAD_BYTES = 2**16
+# In a request's state when its body is not HTTP/1.1.
+BROKEN_BODY = "broken_body"
 # The application itself answers a slow body (service/middleware.py); it gets this long for it.
 GRACE_SECONDS = 5.0
 
@@ -95,7 +97,15 @@ class LimitedProtocol(HttpToolsProtocol):
             self._unread.cancel()
 
     def send_400_response(self, msg: str) -> None:
-        self._refuse(Problem("malformed_request"))
+        cycle = self.cycle
+        if cycle is None or not cycle.more_body:
+            self._refuse(Problem("malformed_request"))
+        elif cycle.response_complete:  # of a body that nobody wanted
+            self.transport.close()
+        else:  # the application answers, under the request's id
+            cycle.scope["state"][BROKEN_BODY] = True
+            cycle.keep_alive = False
+            cycle.message_event.set()
 
     def _limit(self, seconds: float | None) -> None:
         if self._timer is not None:
@@ -110,10 +120,14 @@ class LimitedProtocol(HttpToolsProtocol):
 
     def _refuse(self, problem: Problem) -> None:
         if self.cycle is None or self.cycle.response_complete:
-            response = problem.plain_response("", secrets.token_hex(8), {"Connection": "close"})
-            head = f"HTTP/1.1 {response.status_code} {problem.title}\r\n".encode()
-            fields = b"".join(
-                name + b": " + value + b"\r\n" for name, value in response.raw_headers
-            )
-            self.transport.write(head + fields + b"\r\n" + bytes(response.body))
+            self.transport.write(last_answer(problem, "", secrets.token_hex(8)))
         self.transport.close()
+
+
+def last_answer(problem: Problem, instance: str, request_id: str) -> bytes:
+    """A problem as it is sent on a connection that is closed after it."""
+    headers = {**(problem.headers or {}), "Connection": "close", "X-Request-ID": request_id}
+    response = problem.plain_response(instance, request_id, headers)
+    head = f"HTTP/1.1 {response.status_code} {problem.title}\r\n".encode()
+    fields = b"".join(name + b": " + value + b"\r\n" for name, value in response.raw_headers)
+    return head + fields + b"\r\n" + bytes(response.body)

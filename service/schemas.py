@@ -257,6 +257,7 @@ class DriveOptions(PictureOptions):
         None,
         description="Add the motion since the `reference` frame to the portrait's own expression "
         "and pose, instead of copying the driver's. Default: true with a reference.",
+        examples=[True],
     )
     camera: CameraChoice = "source"
 

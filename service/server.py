@@ -14,6 +14,7 @@ import uvicorn
 
 from service import logs
 from service.app import create_app
+from service.handshake import Handshake
 from service.protocol import LimitedProtocol
 from service.settings import Settings
 from service.state import Service
@@ -36,7 +37,7 @@ def serve(settings: Settings, bound: socket.socket, banner: str) -> None:
     config = uvicorn.Config(
         app,
         http=LimitedProtocol,
-        ws="websockets-sansio",
+        ws=Handshake,
         ws_max_size=MAX_WEBSOCKET_MESSAGE,
         ws_per_message_deflate=False,  # pictures do not get smaller
         log_config=None,

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-import os
-import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
+from cvthead.runtime.sessions import lower_priority
 from service.metrics import Metrics, Queue
 from service.problems import Problem, retry_after
 
@@ -121,10 +119,7 @@ class Worker:
         self._items = live
 
     def _run(self) -> None:
-        if self._niceness and sys.platform == "linux":
-            with suppress(OSError):
-                # On Linux a priority belongs to a thread, and threads it starts inherit it.
-                os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), self._niceness)
+        lower_priority(self._niceness)
         while self._do(self._take()):
             pass
 

@@ -32,6 +32,8 @@ from cvthead.runtime.threads import cores
 Precision = Literal["int8", "float32"]
 Array = NDArray[np.float32]
 
+# Driving frames are tracked by DECA; the other networks only encode.
+EVERY_FRAME = (DECA_ONNX, UNET_ONNX)
 # A portrait's pass takes hundreds of megabytes, which the frames after it do not need.
 GIVE_BACK = ("memory.enable_memory_arena_shrinkage", "cpu:0")
 
@@ -98,6 +100,7 @@ class OfficialNetworks:
         precision: Precision = "int8",
         threads: int | None = None,
         providers: Sequence[str] = CPU,
+        encode_niceness: int = 0,
     ) -> OfficialNetworks:
         """Load an imported model.
 
@@ -107,6 +110,7 @@ class OfficialNetworks:
                 them close enough to float; "float32" never does.
             threads: of each network; None takes the machine's cores.
             providers: see cvthead.runtime.sessions.
+            encode_niceness: as cvthead.preset.load_preset has it.
 
         Raises:
             AssetError: nothing was imported there; a file is missing, altered or does not fit; or
@@ -125,7 +129,9 @@ class OfficialNetworks:
 
         def opened(name: str, *, keeps_memory: bool = False) -> Network:
             served = EIGHT_BIT[name] if chosen.get(name) == "int8" else name
-            session = open_session(str(manifest.checked(served)), count, providers)
+            niceness = 0 if name in EVERY_FRAME else encode_niceness
+            path = str(manifest.checked(served))
+            session = open_session(path, count, providers, niceness=niceness)
             return Network(session, keeps_memory)
 
         return cls(

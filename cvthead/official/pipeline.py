@@ -70,6 +70,7 @@ class OfficialPipeline:
         precision: Precision = "int8",
         threads: int | None = None,
         providers: Sequence[str] = CPU,
+        encode_niceness: int = 0,
     ) -> OfficialPipeline:
         """Load an imported model.
 
@@ -80,13 +81,18 @@ class OfficialPipeline:
             threads: of each network; None takes the machine's cores.
             providers: of the networks, see cvthead.runtime.sessions; the open tracker's run on
                 the CPU.
+            encode_niceness: as cvthead.preset.load_preset has it.
 
         Raises:
             AssetError: nothing was imported there, it is damaged, or onnxruntime lacks a provider.
         """
         folder = folder or default_folder()
         networks = OfficialNetworks.load(
-            folder, precision=precision, threads=threads, providers=providers
+            folder,
+            precision=precision,
+            threads=threads,
+            providers=providers,
+            encode_niceness=encode_niceness,
         )
         finder, flame = Tracker.load(), networks.flame
         head = flame.head()

@@ -44,7 +44,12 @@ class Networks:
 
     @classmethod
     def load(
-        cls, path: Path, *, threads: int | None = None, providers: Sequence[str] = CPU
+        cls,
+        path: Path,
+        *,
+        threads: int | None = None,
+        providers: Sequence[str] = CPU,
+        encode_niceness: int = 0,
     ) -> Networks:
         """Open the networks of a model folder.
 
@@ -52,6 +57,7 @@ class Networks:
             path: the folder.
             threads: of each network; None takes the machine's cores, at most 4.
             providers: see cvthead.runtime.sessions.
+            encode_niceness: as cvthead.preset.load_preset has it.
 
         Raises:
             AssetError: a file is missing or altered, or onnxruntime lacks a provider.
@@ -59,7 +65,8 @@ class Networks:
         folder = ModelFolder.load(path)
         count = threads or min(MAX_THREADS, cores())
         describe, paint = (
-            open_session(folder.read(name), count, providers) for name in (DESCRIBE, PAINT)
+            open_session(folder.read(name), count, providers, niceness=niceness)
+            for name, niceness in ((DESCRIBE, encode_niceness), (PAINT, 0))
         )
         _, size, _, channels = paint.get_inputs()[0].shape
         descriptors = channels - code_size(0)

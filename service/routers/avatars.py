@@ -11,7 +11,7 @@ from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from cvthead.errors import AvatarExpiredError, AvatarFileError, AvatarNotFoundError
 from cvthead.preset import AnyAvatar
 from cvthead.record import AvatarRecord, Box
-from service.answers import EXAMPLE_ID, AvatarInfo, AvatarPage, AvatarSummary
+from service.answers import EXAMPLE_CURSOR, EXAMPLE_ID, AvatarInfo, AvatarPage, AvatarSummary
 from service.bodies import image_body, read_upload
 from service.idempotency import Claim, Idempotency, idempotency
 from service.keys import Tenant, TenantDep
@@ -119,7 +119,8 @@ async def listing(
         int, Query(ge=1, le=MAX_PAGE, description="Avatars per page.", examples=[20])
     ] = 50,
     cursor: Annotated[
-        str | None, Query(description="`next` of the page before.", max_length=100)
+        str | None,
+        Query(description="`next` of the page before.", max_length=100, examples=[EXAMPLE_CURSOR]),
     ] = None,
 ) -> AvatarPage:
     """Newest first. Pages stay complete while avatars are uploaded and deleted."""

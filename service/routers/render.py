@@ -6,14 +6,19 @@ import asyncio
 import time
 from typing import Annotated
 
+import numpy as np
 from fastapi import APIRouter, Query, Request, Response
+from numpy.typing import NDArray
 
-from cvthead.camera import Crop
 from cvthead.crop import head_crop
 from cvthead.driving import drive
+from cvthead.head.model import HeadModel
+from cvthead.preset import AnyAvatar
 from cvthead.tracking.tracker import TrackedFace
 from service.bodies import Upload, image_body, json_body, read_json, read_upload
+from service.engine import Pose
 from service.keys import TenantDep
+from service.motion import LONGEST_SIDE
 from service.negotiation import image_format
 from service.pictures import PICTURE, UPLOAD, output_of, picture_responses, send_frame
 from service.routers import batch
@@ -71,8 +76,9 @@ async def driven(
     options: Annotated[DriveOptions, Query()],
 ) -> Response:
     """The driving frame is a raw body or the part `image` of a multipart one; its largest face
-    drives. A part `reference` is a frame in which the driver looks as the portrait does. The
-    format is negotiated by `Accept`: PNG (default), JPEG or WebP."""
+    drives. A part `reference` is a frame in which the driver looks as the portrait does. Both are
+    shrunk to 960 pixels, as the frames of a stream are. The format is negotiated by `Accept`: PNG
+    (default), JPEG or WebP."""
     kind = image_format(request)
     avatar = await load(service, tenant, avatar_id)
     service.engine.check_render()
@@ -84,11 +90,10 @@ async def driven(
     begin = time.perf_counter()
     face, reference = await unless_gone(request, _tracked(service, upload))
     timings = {"track": (time.perf_counter() - begin) * 1000}
-    crop = _crop(service, reference or face) if options.camera == "driver" else None
     start = None if options.relative is False else reference
-    pose = await asyncio.to_thread(
-        drive, service.engine.pipeline.head, avatar, face, reference=start, crop=crop
-    )
+    seen = (reference or face) if options.camera == "driver" else None
+    # Too long for the event loop, above all with a crop.
+    pose = await asyncio.to_thread(_pose, service.pipeline.head, avatar, face, start, seen)
     return await send_frame(request, service, avatar, pose, output, timings)
 
 
@@ -98,11 +103,24 @@ async def _tracked(
     """The driving face, and the reference's, whose identity it then shares."""
     engine = service.engine
     if "reference" not in upload.images:
-        return await engine.track(await engine.decode(upload.images["image"])), None
-    reference = await engine.track(await engine.decode(upload.images["reference"]))
-    image = await engine.decode(upload.images["image"])
+        return await engine.track(await _decoded(service, upload, "image")), None
+    reference = await engine.track(await _decoded(service, upload, "reference"))
+    image = await _decoded(service, upload, "image")
     return await engine.track(image, shape=reference.coefficients.shape), reference
 
 
-def _crop(service: Service, face: TrackedFace) -> Crop:
-    return head_crop(service.pipeline.head, face.coefficients, face.camera)
+async def _decoded(service: Service, upload: Upload[DriveOptions], name: str) -> NDArray[np.uint8]:
+    """Small, as a stream's frames: no pixel coordinates of it are in the answer."""
+    return await service.engine.decode(upload.images[name], longest=LONGEST_SIDE)
+
+
+def _pose(
+    head: HeadModel,
+    avatar: AnyAvatar,
+    face: TrackedFace,
+    reference: TrackedFace | None,
+    seen: TrackedFace | None,
+) -> Pose:
+    """What ``face`` asks for; the camera stands where it sees the head of ``seen``."""
+    crop = None if seen is None else head_crop(head, seen.coefficients, seen.camera)
+    return drive(head, avatar, face, reference=reference, crop=crop)

@@ -16,7 +16,7 @@ class Ticket(BaseModel):
     """Opens one stream as ``?ticket=``."""
 
     ticket: str = Field(description="Valid once.", examples=["q3Jm1s1u8mA..."])
-    expires_in: float = Field(description="Seconds until it is worthless.", examples=[30])
+    expires_in: float = Field(description="Seconds until it is worthless.", gt=0, examples=[30])
 
 
 @router.post(

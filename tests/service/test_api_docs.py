@@ -64,7 +64,7 @@ def test_the_examples_work_as_pasted(server: Server, tmp_path: Path) -> None:
     assert (tmp_path / "frames.zip").read_bytes()[:2] == b"PK"
 
 
-def test_every_field_has_a_description(openapi: Any) -> None:
+def test_every_field_has_a_description_and_an_example(openapi: Any) -> None:
     """Parameters, request fields and answer fields, wherever they are in the document."""
     bare: list[str] = []
 
@@ -74,11 +74,12 @@ def test_every_field_has_a_description(openapi: Any) -> None:
                 visit(entry, f"{place}/{index}")
         if not isinstance(node, dict):
             return
-        if "in" in node and "schema" in node and not node.get("description"):
-            bare.append(place)
+        if "in" in node and "schema" in node:
+            # Its examples can be its own or its schema's.
+            bare.extend(f"{place} {lack}" for lack in _lacks(node["schema"] | node))
         for name, field in node.get("properties", {}).items():
-            if isinstance(field, dict) and not _described(field):
-                bare.append(f"{place}/{name}")
+            if isinstance(field, dict):
+                bare.extend(f"{place}/{name} {lack}" for lack in _lacks(field))
         for key, value in node.items():
             if key not in ("example", "examples", "default", "enum"):
                 visit(value, f"{place}/{key}")
@@ -87,9 +88,14 @@ def test_every_field_has_a_description(openapi: Any) -> None:
     assert not bare
 
 
-def _described(field: dict[str, Any]) -> bool:
-    """By itself, by the object it refers to, or as a file."""
+def _lacks(field: dict[str, Any]) -> list[str]:
+    """What a field does not say by itself, by the object that it is or refers to, or as a file.
+    The values of an enumeration or of a boolean are its examples."""
     nested = [field, *field.get("anyOf", []), field.get("items", {})]
-    return any(
-        "description" in part or "$ref" in part or part.get("format") == "binary" for part in nested
-    )
+    keys = {key for part in nested for key in part}
+    if keys & {"$ref", "properties"} or any(part.get("format") == "binary" for part in nested):
+        return []
+    shown = keys & {"examples", "example", "enum", "const"}
+    shown |= {"boolean"} & {part.get("type") for part in nested}
+    there = {"description": "description" in keys, "example": bool(shown)}
+    return [name for name, given in there.items() if not given]

@@ -18,6 +18,7 @@ from server_process import Server
 
 from cvthead.provenance import SourceType, read_mark
 from cvthead.video import probe_video, read_frames
+from service.frames import AHEAD
 
 FRAMES = [{"arkit": {"jawOpen": value}} for value in (0.0, 0.4, 0.9)]
 
@@ -120,20 +121,32 @@ def test_refused_kinds(client: httpx.Client, path: str) -> None:
 def test_a_client_that_leaves_stops_the_work(
     server: Server, client: httpx.Client, path: str
 ) -> None:
+    frames = 1000
+    before = painted(client)
     with server.client() as leaving:
-        request: Any = {"frames": [{}] * 1000}
+        request: Any = {"frames": [{}] * frames}
         with leaving.stream("POST", f"{path}/batch", json=request) as answer:
             assert answer.status_code == 200
-            next(answer.iter_bytes())
-    deadline = time.monotonic() + 30
-    while time.monotonic() < deadline:
-        before = painted(client)
-        time.sleep(1)
-        if painted(client) == before:
-            return
-    pytest.fail("frames are still painted for a client that has gone")
+            first = next(answer.iter_bytes())
+            when_it_came = painted(client)
+    assert first.startswith(b"--")
+    assert when_it_came - before < frames / 2, "the first part waited for the others"
+    deadline = time.monotonic() + 60
+    while metric(client, "cvthead_requests_in_flight") > 1:  # this one
+        assert time.monotonic() < deadline, "the batch of a client that has gone goes on"
+        time.sleep(0.05)
+    settled = painted(client)
+    assert 0 < settled - before < frames / 2, "painted for a client that has gone"
+    renders = 10
+    for _ in range(renders):  # each would wait behind frames of the batch
+        assert client.post(f"{path}/render").status_code == 200
+    assert painted(client) - settled <= renders + AHEAD
 
 
 def painted(client: httpx.Client) -> float:
-    line = 'cvthead_stage_seconds_count{stage="paint"} '
-    return float(client.get("/metrics").text.partition(line)[2].split()[0])
+    """Frames so far."""
+    return metric(client, "cvthead_batch_size_sum")
+
+
+def metric(client: httpx.Client, name: str) -> float:
+    return float(client.get("/metrics").text.partition(f"\n{name} ")[2].split()[0])

@@ -71,6 +71,18 @@ def test_a_reference_makes_the_motion_relative(
     assert difference(followed, plain) < 6
 
 
+def test_the_number_of_pixels_does_not_matter(
+    client: httpx.Client, path: str, plain: np.ndarray
+) -> None:
+    """The same picture twice, once with twice the pixels a side: the head has neither moved nor
+    grown."""
+    small, large = (saved(portrait(side), "JPEG", quality=95) for side in (1000, 2000))
+    files = {"image": ("a.jpg", large), "reference": ("b.jpg", small)}
+    answer = client.post(f"{path}/drive", files=files, data={"camera": "driver"})
+    assert answer.status_code == 200, answer.text
+    assert difference(pixels(answer.content), plain) < 6
+
+
 def test_drive_refuses(client: httpx.Client, path: str) -> None:
     refused(drive(client, path, PORTRAIT.read_bytes(), relative=True), 422, "invalid_request")
     refused(drive(client, path, PORTRAIT.read_bytes(), camera="mine"), 422, "invalid_request")

@@ -7,6 +7,7 @@ import socket
 import time
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import httpx
@@ -90,11 +91,46 @@ def test_work_of_clients_that_left_is_skipped(tiny: Server, path: str) -> None:
             leave_early(tiny, target, content, kind)
     deadline = time.monotonic() + 60
     with tiny.client() as client:
-        while in_flight(client) > 1:  # this one
+        while metric(client, IN_FLIGHT) > 1:  # this one
             assert time.monotonic() < deadline, "requests of clients that left are still there"
             time.sleep(0.2)
         assert client.post(f"{path}/render").status_code == 200
         assert "Traceback" not in tiny.logs()
+
+
+def test_an_upload_whose_client_left_is_not_encoded(tiny: Server, path: str) -> None:
+    """One upload is being encoded, one waits: the second's client leaves, and it is skipped."""
+    with tiny.client() as client:
+        before = metric(client, CANCELLED)
+        deadline = time.monotonic() + TIMEOUT
+        while metric(client, CANCELLED) == before:
+            assert time.monotonic() < deadline, "no upload was skipped"
+            with ExitStack() as links:
+                for _ in range(2):
+                    links.enter_context(uploading(tiny))
+                while metric(client, WAITING) == 0 and metric(client, IN_FLIGHT) > 1:
+                    time.sleep(0.01)
+            while metric(client, IN_FLIGHT) > 1:
+                time.sleep(0.05)
+            # Behind the one that has begun, the skipped one makes room for this one.
+            answer = client.post("/v1/avatars", content=PORTRAIT.read_bytes())
+            assert answer.status_code == 201, answer.text
+
+
+CANCELLED = 'cvthead_cancelled_total{queue="encode"}'
+WAITING = 'cvthead_queue_depth{queue="encode"}'
+IN_FLIGHT = "cvthead_requests_in_flight"
+
+
+@contextmanager
+def uploading(server: Server) -> Iterator[None]:
+    """A client that has sent its portrait and waits; it leaves at the end."""
+    host, port = server.host.split(":")
+    data = PORTRAIT.read_bytes()
+    head = f"POST /v1/avatars HTTP/1.1\r\nHost: {server.host}\r\nContent-Length: {len(data)}"
+    with socket.create_connection((host, int(port))) as link:
+        link.sendall(f"{head}\r\n\r\n".encode() + data)
+        yield
 
 
 def leave_early(server: Server, path: str, content: bytes, kind: str) -> None:
@@ -108,7 +144,5 @@ def leave_early(server: Server, path: str, content: bytes, kind: str) -> None:
         time.sleep(0.05)
 
 
-def in_flight(client: httpx.Client) -> float:
-    return float(
-        client.get("/metrics").text.partition("\ncvthead_requests_in_flight ")[2].split()[0]
-    )
+def metric(client: httpx.Client, series: str) -> float:
+    return float(client.get("/metrics").text.partition(f"\n{series} ")[2].split()[0])

@@ -97,6 +97,37 @@ def test_unknown_paths_on_the_wire(client: httpx.Client) -> None:
         assert answer.json()["code"] == code
 
 
+@pytest.mark.parametrize(
+    ("path", "allowed"),
+    [
+        ("/v1/avatars", "GET, POST"),
+        ("/v1/avatars/0", "GET, DELETE"),
+        ("/v1/avatars/0/render", "POST"),
+        ("/v1/models", "GET"),
+        ("/", "GET, HEAD"),
+    ],
+)
+def test_allow_lists_all_methods_of_the_path(client: httpx.Client, path: str, allowed: str) -> None:
+    answer = client.put(path)
+    assert (answer.status_code, answer.headers["allow"]) == (405, allowed)
+
+
+def test_openapi_says_what_needs_a_key(client: httpx.Client) -> None:
+    schema = client.get("/openapi.json").json()
+    for path, operations in schema["paths"].items():
+        for method, operation in operations.items():
+            guarded = "unauthorized" in str(operation["responses"].get("401"))
+            assert bool(operation.get("security")) is guarded, f"{method} {path}"
+    assert schema["paths"]["/metrics"]["get"]["security"]
+
+
+def test_openapi_has_what_the_core_says_of_a_face(client: httpx.Client) -> None:
+    paths = client.get("/openapi.json").json()["paths"]
+    content = paths["/v1/avatars"]["post"]["responses"]["422"]["content"]
+    examples = content["application/problem+json"]["examples"]
+    assert {"no_face", "several_faces", "face_turned_away", "face_error"} <= examples.keys()
+
+
 def test_openapi_documents_problems_everywhere(client: httpx.Client) -> None:
     schema = client.get("/openapi.json").json()
     assert "ProblemBody" in schema["components"]["schemas"]
@@ -184,6 +215,18 @@ def test_cors_on_the_wire(guarded: Server) -> None:
         assert answer.headers["access-control-allow-origin"] == "https://friend.example"
         refused = nobody.options("/v1/avatars", headers=asked | {"Origin": "https://foe.example"})
         assert refused.json()["code"] == "forbidden"
+        answer = nobody.get("/v1/models", headers=asked)
+        exposed = set(answer.headers["access-control-expose-headers"].split(", "))
+        paths = nobody.get("/openapi.json").json()["paths"]
+    documented = {
+        name
+        for operations in paths.values()
+        for operation in operations.values()
+        for answer in operation["responses"].values()
+        for name in answer.get("headers", {})
+    }
+    assert {"Location", "X-Digital-Source-Type", "Idempotency-Replayed"} <= documented
+    assert documented - {"Vary"} <= exposed  # which is for caches
 
 
 def send_chunks(wire: socket.socket, total: int) -> None:
