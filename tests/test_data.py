@@ -11,17 +11,20 @@ import tarfile
 import time
 from pathlib import Path, PurePath
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
 from webdataset.tariterators import group_by_keys, tar_file_expander
 
 from cvthead.cli.main import main
-from cvthead.data.layout import find_items, identity_of, key_of, split_of
+from cvthead.data.layout import SPLITS, find_items, identity_of, key_of, split_of
 from cvthead.data.prepare import Settings, pack, prepare, resume, waiting
 from cvthead.data.tracking import Outcome
 from cvthead.errors import InputError
+from cvthead.images import read_image
 from cvthead.training.records import records_hash, stored_records
+from cvthead.video_writer import video_writer
 
 PORTRAIT = Path(__file__).parents[1] / "examples" / "astronaut.png"
 
@@ -142,12 +145,9 @@ def test_a_shard_without_index_is_refused(prepared: Path, tmp_path: Path) -> Non
         stored_records(tmp_path)
 
 
-def test_a_kill_loses_no_finished_file(videos: Path, prepared: Path, tmp_path: Path) -> None:
-    """Stops right after the first file is journaled; the next call completes the folder."""
-    out = tmp_path / "out"
-    arguments = ["data", "prepare", str(videos), str(out), "--val", "0", "--test", "0"]
+def kill_after_first_file(arguments: list[str], out: Path) -> None:
+    """Run the command until the first file is journaled."""
     command = [sys.executable, "-m", "cvthead.cli.main", *arguments]
-    command += ["--processes", "1", "--shard-size", "1"]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as run:
         journal = out / "journal.jsonl"
         while run.poll() is None and not (
@@ -156,12 +156,102 @@ def test_a_kill_loses_no_finished_file(videos: Path, prepared: Path, tmp_path: P
             time.sleep(0.01)
         run.send_signal(signal.SIGKILL)
     assert run.returncode == -signal.SIGKILL
-    with journal.open("a") as file:
+
+
+def test_a_kill_loses_no_finished_file(videos: Path, prepared: Path, tmp_path: Path) -> None:
+    """Stops right after the first file is journaled; the next call completes the folder."""
+    out = tmp_path / "out"
+    arguments = ["data", "prepare", str(videos), str(out), "--val", "0", "--test", "0"]
+    arguments += ["--processes", "1", "--shard-size", "1"]
+    kill_after_first_file(arguments, out)
+    with (out / "journal.jsonl").open("a") as file:
         file.write('{"key": "cut o')  # as a kill in mid-write leaves it
-    assert main([*arguments, "--processes", "1", "--shard-size", "1"]) == 0
+    assert main(arguments) == 0
     assert records_hash(out / "train") == records_hash(prepared / "train")
     whole, resumed = (sorted((folder / "train").glob("*.tar")) for folder in (prepared, out))
     assert [s.read_bytes() for s in whole] == [s.read_bytes() for s in resumed]
+
+
+FRAMES = 6  # sampled from each clip of 8
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A person of each split in a clip of 8 frames, in which the head moves to the right and
+    nods."""
+    folder = tmp_path_factory.mktemp("clips")
+    image = read_image(PORTRAIT)
+    size = image.shape[1], image.shape[0]
+    for split in SPLITS:
+        people = (f"id{number:05d}" for number in range(1000))
+        person = next(one for one in people if split_of(one, val=0.3, test=0.3) == split)
+        path = folder / person / "x" / "00001.mp4"
+        path.parent.mkdir(parents=True)
+        with video_writer(path, size=size, fps=25) as write:
+            for step in range(8):
+                turn = cv2.getRotationMatrix2D((size[0] / 2, size[1] / 2), 0.5 * step, 1)
+                turn[0, 2] += 4 * step
+                frame = cv2.warpAffine(image, turn, size, borderMode=cv2.BORDER_REPLICATE)
+                write(frame.astype(np.uint8))
+    return folder
+
+
+CLIP_OPTIONS = ["--crop", "clip", "--frames", str(FRAMES), "--val", "0.3", "--test", "0.3"]
+CLIP_OPTIONS += ["--processes", "2"]
+
+
+@pytest.fixture(scope="module")
+def prepared_clips(clips: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Made by two processes, in two calls: the first is killed."""
+    out = tmp_path_factory.mktemp("prepared_clips")
+    arguments = ["data", "prepare", str(clips), str(out), *CLIP_OPTIONS]
+    kill_after_first_file(arguments, out)
+    finished = len((out / "journal.jsonl").read_text().splitlines()) - 1
+    assert 0 < finished < len(SPLITS)
+    assert main(arguments) == 0
+    return out
+
+
+def test_videos_of_every_split_become_records(clips: Path, prepared_clips: Path) -> None:
+    report = json.loads((prepared_clips / "report.json").read_text())
+    one = {"records": 1, "frames": FRAMES, "identities": 1}
+    assert report["kept"] == dict.fromkeys(SPLITS, one)
+    items, _ = find_items(clips, val=0.3, test=0.3)
+    assert {item.split for item in items} == set(SPLITS)
+    for item in items:
+        (stored,) = stored_records(prepared_clips / item.split)
+        assert stored.frames == stored.open().frames == FRAMES
+        (shard,) = (prepared_clips / item.split).glob("*.tar")
+        with tarfile.open(shard) as tar:
+            file = tar.extractfile(f"{item.key}.json")
+            assert file is not None
+            assert json.load(file) == {
+                "file": item.file.as_posix(),
+                "identity": item.identity,
+                "split": item.split,
+                "frames": FRAMES,
+                "crop": "clip",
+            }
+
+
+def test_an_interrupted_call_does_every_video_once(clips: Path, prepared_clips: Path) -> None:
+    _, *lines = (prepared_clips / "journal.jsonl").read_text().splitlines()
+    items, _ = find_items(clips, val=0.3, test=0.3)
+    assert sorted(json.loads(line)["key"] for line in lines) == sorted(item.key for item in items)
+    assert not (prepared_clips / "pending").exists()
+
+
+def test_the_crop_stays_within_a_clip_and_the_head_moves_in_it(prepared_clips: Path) -> None:
+    """A fixed crop leaves the head's own motion to the camera and the pixels outside the video
+    where they are; the head crop would cancel the one and move the others."""
+    (stored,) = stored_records(prepared_clips / "train")
+    record = stored.open()
+    frames = [record.frame(number) for number in range(record.frames)]
+    assert all((frame.valid == frames[0].valid).all() for frame in frames)
+    shifts = np.array([frame.camera.tx for frame in frames])
+    assert (np.diff(shifts) > 0).all()
+    scales = np.array([frame.camera.scale for frame in frames])
+    assert np.ptp(scales) < 0.05 * scales.mean()
 
 
 def test_a_kill_between_shard_and_clean_up_packs_nothing_twice(tmp_path: Path) -> None:

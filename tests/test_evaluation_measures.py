@@ -96,12 +96,20 @@ def test_big_pose_pairs_of_a_turning_clip_are_few_and_spread(portrait: Shot) -> 
 
 
 def test_drivers_of_other_people_only_and_the_same_each_time() -> None:
-    chosen = pairs(5, 2, 4)
+    chosen = pairs("abcde", 2, 4)
     assert len(chosen) == len(set(chosen)) == 20
     assert all(driver // 2 != source for source, driver in chosen)
-    assert chosen == pairs(5, 2, 4)
-    assert pairs(1, 2, 4) == []
-    assert len(pairs(2, 2, 4)) == 4
+    assert chosen == pairs("abcde", 2, 4)
+    assert pairs("a", 2, 4) == []
+    assert len(pairs("ab", 2, 4)) == 4
+
+
+def test_nobody_is_driven_by_another_clip_of_the_same_person() -> None:
+    people = "aabca"
+    chosen = pairs(people, 2, 4)
+    assert len(chosen) == len(set(chosen)) == 20
+    assert all(people[source] != people[driver // 2] for source, driver in chosen)
+    assert pairs("aaa", 2, 4) == []
 
 
 def test_normalised_similarity_is_0_for_strangers_and_1_for_the_same() -> None:

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import onnx
 import pytest
-from onnx import TensorProto, helper, numpy_helper
+from made_networks import SIZE, distance, features
 from scipy import linalg
 
 pytest.importorskip("torch")
 
-from cvthead.errors import CVTHeadError, InputError
+from cvthead.errors import InputError
 from cvthead.evaluation.metrics import Metrics
 from cvthead.evaluation.paper_metrics import (
     UserNetworks,
@@ -22,44 +20,6 @@ from cvthead.evaluation.paper_metrics import (
     quality,
 )
 from cvthead.evaluation.picture_networks import PictureNetwork, as_batch
-
-SIZE = 256
-
-
-def save(path: Path, nodes: Sequence[onnx.NodeProto], inputs: int, weights: np.ndarray) -> Path:
-    picture = [1, 3, SIZE, SIZE]
-    graph = helper.make_graph(
-        nodes,
-        "seeded",
-        [helper.make_tensor_value_info(f"x{i}", TensorProto.FLOAT, picture) for i in range(inputs)],
-        [helper.make_tensor_value_info("y", TensorProto.FLOAT, None)],
-        [numpy_helper.from_array(weights, "w")],
-    )
-    opset = helper.make_opsetid("", 17)
-    onnx.save(helper.make_model(graph, opset_imports=[opset], ir_version=9), path)
-    return path
-
-
-def features(path: Path, size: int) -> Path:
-    """Convolution with random weights, then the mean over the picture: (1, size, 1, 1)."""
-    weights = np.random.default_rng(0).normal(size=(size, 3, 8, 8)).astype(np.float32)
-    nodes = [
-        helper.make_node("Conv", ["x0", "w"], ["c"], strides=[8, 8]),
-        helper.make_node("Relu", ["c"], ["r"]),
-        helper.make_node("GlobalAveragePool", ["r"], ["y"]),
-    ]
-    return save(path, nodes, 1, weights)
-
-
-def distance(path: Path) -> Path:
-    """Mean absolute difference of two pictures times a weight: (1, 1, 1, 1)."""
-    nodes = [
-        helper.make_node("Sub", ["x0", "x1"], ["d"]),
-        helper.make_node("Abs", ["d"], ["a"]),
-        helper.make_node("Mul", ["a", "w"], ["m"]),
-        helper.make_node("ReduceMean", ["m"], ["y"], axes=[1, 2, 3], keepdims=1),
-    ]
-    return save(path, nodes, 2, np.array([0.5], np.float32))
 
 
 def pictures(seed: int, count: int) -> list[np.ndarray]:
@@ -83,10 +43,7 @@ def test_frechet_distance_is_that_of_the_formula(tmp_path: Path) -> None:
 
 
 def test_lpips_is_measured_by_the_users_network(tmp_path: Path) -> None:
-    try:
-        metrics = Metrics(lpips=PictureNetwork.load(distance(tmp_path / "lpips.onnx"), inputs=2))
-    except CVTHeadError as error:
-        pytest.skip(f"no perceptual weights: {error}")
+    metrics = Metrics(lpips=PictureNetwork.load(distance(tmp_path / "lpips.onnx"), inputs=2))
     black = np.zeros((SIZE, SIZE, 3), np.float32)
     mask, valid = np.ones((SIZE, SIZE), np.float32), np.ones((SIZE, SIZE), bool)
     scores = metrics.scores([black + np.float32(0.25), black], black, mask, valid)

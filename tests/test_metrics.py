@@ -2,14 +2,17 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import astuple
+from dataclasses import astuple, replace
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
 
 from cvthead.errors import CVTHeadError  # noqa: E402
+from cvthead.evaluation.groups import Reconstruction, group_tables  # noqa: E402
 from cvthead.evaluation.metrics import (  # noqa: E402
     C1,
     PSNR_CAP,
@@ -20,7 +23,14 @@ from cvthead.evaluation.metrics import (  # noqa: E402
     ms_ssim,
     on_white,
     psnr,
+    tensor,
 )
+from cvthead.evaluation.reenactment import Reenactment, score_table  # noqa: E402
+from cvthead.evaluation.two_sources import likeness_table  # noqa: E402
+from cvthead.images import read_image  # noqa: E402
+from cvthead.training.perceptual import STLPIPS  # noqa: E402
+
+PORTRAIT = Path(__file__).parents[1] / "examples" / "astronaut.png"
 
 SIZE = 192
 EVERYWHERE = np.ones((SIZE, SIZE), dtype=bool)
@@ -38,7 +48,7 @@ def picture() -> np.ndarray:
 @pytest.fixture(scope="module")
 def metrics() -> Metrics:
     try:
-        return Metrics()
+        return Metrics(STLPIPS("alex"))
     except CVTHeadError as error:
         pytest.skip(f"no perceptual weights: {error}")
 
@@ -62,6 +72,8 @@ def test_every_metric_worsens_with_noise(metrics: Metrics, picture: np.ndarray) 
     for better, worse in itertools.pairwise(scores):
         assert better.l1 < worse.l1
         assert better.psnr > worse.psnr
+        assert better.st_lpips is not None
+        assert worse.st_lpips is not None
         assert better.st_lpips < worse.st_lpips
         assert better.ms_ssim > worse.ms_ssim
 
@@ -73,6 +85,24 @@ def test_several_results_score_as_each_alone(metrics: Metrics, picture: np.ndarr
     for result, score in zip(results, together, strict=True):
         alone = metrics.scores([result], picture, mask, EVERYWHERE)[0]
         assert astuple(score)[:4] == pytest.approx(astuple(alone)[:4], rel=1e-4)
+
+
+def test_without_perceptual_weights_their_figure_alone_is_absent(
+    metrics: Metrics, picture: np.ndarray
+) -> None:
+    results, mask = [noisy(picture, 0.1)], np.ones((SIZE, SIZE), np.float32)
+    (bare,) = Metrics().scores(results, picture, mask, EVERYWHERE)
+    (whole,) = metrics.scores(results, picture, mask, EVERYWHERE)
+    assert whole.st_lpips is not None
+    assert bare == replace(whole, st_lpips=None)
+
+    row = f"| A | {bare.l1:.4f} | {bare.psnr:.2f} | absent | {bare.ms_ssim:.4f} |"
+    done = Reenactment("clip", 1, {"A": bare}, {"A": bare}, {}, person=1)
+    assert row in score_table("key", "Caption.", [done]).markdown()
+    assert likeness_table([{"A": bare}]).rows["A"] == (bare.psnr, None)
+    (table,) = group_tables([Reconstruction("x", {"A": bare}, {"A": whole})], 1)
+    assert table.rows["x"][2] is None
+    assert table.rows["x"][5] == pytest.approx(whole.st_lpips)
 
 
 def test_pixels_beyond_the_frame_never_count(metrics: Metrics, picture: np.ndarray) -> None:
@@ -120,6 +150,39 @@ def test_ms_ssim_is_symmetric_and_bounded(picture: np.ndarray) -> None:
     assert 0 < ms_ssim(a, b).item() < 1
 
 
+@pytest.fixture(scope="module")
+def altered() -> tuple[np.ndarray, list[np.ndarray]]:
+    """A real picture (256, 256, 3), and the same with noise, blurred and shifted."""
+    resized = cv2.resize(read_image(PORTRAIT), (256, 256), interpolation=cv2.INTER_AREA)
+    real = (resized / 255).astype(np.float32)
+    return real, [noisy(real, 0.1), cv2.GaussianBlur(real, (0, 0), 3), np.roll(real, 4, axis=1)]
+
+
+def test_psnr_is_that_of_torchmetrics(altered: tuple[np.ndarray, list[np.ndarray]]) -> None:
+    image = pytest.importorskip("torchmetrics.functional.image")
+    real, others = altered
+    valid = np.ones((256, 256), dtype=bool)
+    valid[:40] = False
+    for other in others:
+        kept = torch.from_numpy(other[valid]), torch.from_numpy(real[valid])
+        wanted = float(image.peak_signal_noise_ratio(*kept, data_range=1.0))
+        assert psnr(other, real, valid) == pytest.approx(wanted, abs=1e-4)
+
+
+def test_ms_ssim_is_close_to_that_of_torchmetrics(
+    altered: tuple[np.ndarray, list[np.ndarray]],
+) -> None:
+    """Of grey pictures, so that the order of averaging over channels does not matter; what is
+    left is torchmetrics' border at the smallest scale."""
+    image = pytest.importorskip("torchmetrics.functional.image")
+    real, others = altered
+    grey = [one.mean(2, keepdims=True) for one in (real, *others)]
+    for other in grey[1:]:
+        pair = tensor([other]), tensor([grey[0]])
+        wanted = image.multiscale_structural_similarity_index_measure(*pair, data_range=1.0)
+        assert ms_ssim(*pair).item() == pytest.approx(float(wanted), abs=0.005)
+
+
 def test_on_white_blends_by_the_mask() -> None:
     image = np.zeros((1, 3, 3), np.uint8)
     blended = on_white(image, np.array([[0, 0.25, 1]], np.float32))
@@ -129,8 +192,6 @@ def test_on_white_blends_by_the_mask() -> None:
 @pytest.mark.parametrize("name", ["alex", "vgg"])
 def test_perceptual_distance_of_shifted_pictures_is_small(name: str, picture: np.ndarray) -> None:
     """Shift tolerance: one pixel of shift costs far less than other content."""
-    from cvthead.training.perceptual import STLPIPS
-
     try:
         network = STLPIPS(name)  # type: ignore[arg-type]
     except CVTHeadError as error:
@@ -144,8 +205,6 @@ def test_perceptual_distance_of_shifted_pictures_is_small(name: str, picture: np
 
 
 def test_perceptual_distance_agrees_with_the_mean_of_its_map(picture: np.ndarray) -> None:
-    from cvthead.training.perceptual import STLPIPS
-
     try:
         network = STLPIPS("alex")
     except CVTHeadError as error:
@@ -159,8 +218,6 @@ def test_perceptual_distance_agrees_with_the_mean_of_its_map(picture: np.ndarray
 
 
 def test_perceptual_gradient_is_finite_on_flat_pictures() -> None:
-    from cvthead.training.perceptual import STLPIPS
-
     try:
         network = STLPIPS("alex", fused=True)
     except CVTHeadError as error:

@@ -6,6 +6,7 @@ import argparse
 from importlib.util import find_spec
 from pathlib import Path
 
+from cvthead.data.layout import TEST, VAL
 from cvthead.errors import InputError
 from cvthead.runtime.threads import cores
 
@@ -34,13 +35,13 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         help="square around the head of each frame, as the renderer uses it, or one square per "
         "clip, as FOMM cuts (default: head)",
     )
-    for split in ("val", "test"):
+    for split, share in (("val", VAL), ("test", TEST)):
         prepare.add_argument(
             f"--{split}",
             type=float,
-            default=0.05,
+            default=share,
             metavar="SHARE",
-            help=f"of the identities for {split} (default: 0.05)",
+            help=f"of the identities for {split} (default: {share})",
         )
     prepare.add_argument(
         "--shard-size", type=int, default=256, metavar="N", help="records per shard"

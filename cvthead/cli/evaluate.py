@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import argparse
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, TypeVar
 
 from cvthead.cli.portrait import add_preset_option
+from cvthead.data.layout import SPLITS
 from cvthead.deformation import DeformationModel
 from cvthead.errors import AssetError, InputError
 from cvthead.pipeline import Pipeline
 from cvthead.preset import Preset, load_preset
 from cvthead.runtime.model_folder import ModelFolder
 
-if TYPE_CHECKING:
-    from cvthead.evaluation.identity import Embed
+T = TypeVar("T")
 
 PARTS = {
     "self": "self-reenactment, unseen pixels, motion",
@@ -54,7 +55,17 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         + ".",
     )
     parser.add_argument(
-        "--data", type=Path, required=True, metavar="FOLDER", help="with clips/val and stills/val"
+        "--data",
+        type=Path,
+        required=True,
+        metavar="FOLDER",
+        help="with clips/val and stills/val, or of videos; VoxCeleb's layouts are understood",
+    )
+    parser.add_argument(
+        "--split",
+        choices=SPLITS,
+        help="of a folder of videos only the people whom `cvthead data prepare` puts into this "
+        "split by default",
     )
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("local/evaluation"), metavar="FOLDER"
@@ -94,12 +105,14 @@ def run(args: argparse.Namespace) -> None:
         raise InputError("evaluation needs torch", hint='install with pip install "cvthead[train]"')
     # PyTorch takes seconds to load and is not installed everywhere.
     from cvthead.evaluation.clip import Bench
+    from cvthead.evaluation.identity import dlib_embedder
     from cvthead.evaluation.methods import baselines, trained
     from cvthead.evaluation.metrics import Metrics
     from cvthead.evaluation.paper_metrics import UserNetworks
     from cvthead.evaluation.run import Plan, evaluate
     from cvthead.points import PointLayout
     from cvthead.tracking.tracker import Tracker
+    from cvthead.training.perceptual import STLPIPS
 
     networks = UserNetworks.load(**{name: getattr(args, f"{name}_network") for name in NETWORKS})
     pipelines = load_models(args.preset, args.model)
@@ -120,14 +133,16 @@ def run(args: argparse.Namespace) -> None:
         tracker,
         deformer,
         PointLayout.of(tracker.head),
-        Metrics(lpips=networks.lpips),
+        Metrics(or_absent("ST-LPIPS", partial(STLPIPS, "alex")), networks.lpips),
         methods | baselines(deformer),
         list(methods),
-        embedder(),
+        or_absent("CSIM", dlib_embedder),
         args.drivers,
         frozenset(args.only or PARTS),
     )
-    plan = Plan(args.data, args.output, args.every, args.crossings, args.runs, args.people)
+    plan = Plan(
+        args.data, args.split, args.output, args.every, args.crossings, args.runs, args.people
+    )
     print(evaluate(plan, bench, pipelines, networks).markdown())
     print(args.output / "index.html")
 
@@ -163,12 +178,12 @@ def has_deformation(models: Sequence[str]) -> dict[str, bool]:
     return found
 
 
-def embedder() -> Embed | None:
-    """dlib's, or a warning that CSIM will be absent."""
-    from cvthead.evaluation.identity import dlib_embedder
-
+def or_absent(figure: str, load: Callable[[], T]) -> T | None:
+    """A network, or a warning that its figure will be absent."""
     try:
-        return dlib_embedder()
+        return load()
     except AssetError as error:
-        warnings.warn(f"{error}, and is absent: {error.hint}", stacklevel=2)
+        # What pip says has several lines.
+        reason = " ".join(str(error).split())
+        warnings.warn(f"{figure} is absent: {reason}; {error.hint}", stacklevel=2)
         return None

@@ -19,6 +19,8 @@ Split = Literal["train", "val", "test"]
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".webm", ".avi", ".mkv", ".gif"})
 STILL_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp"})
+# Default shares of the identities.
+VAL, TEST = 0.05, 0.05
 # Folders that VoxCeleb's archives put above the identities.
 WRAPPERS = frozenset({"dev", "test", "mp4"})
 VOXCELEB = re.compile(r"id\d{5}")

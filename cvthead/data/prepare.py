@@ -31,7 +31,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from cvthead.data.layout import SPLITS, Item, Split, find_items
+from cvthead.data.layout import SPLITS, TEST, VAL, Item, Split, find_items
 from cvthead.data.report import Report
 from cvthead.data.shards import write_shard
 from cvthead.data.tracking import CropStyle, Outcome, make_record
@@ -55,8 +55,8 @@ class Settings:
         shard_size: records per shard.
     """
 
-    val: float = 0.05
-    test: float = 0.05
+    val: float = VAL
+    test: float = TEST
     frames: int = 30
     crop: CropStyle = "head"
     shard_size: int = 256

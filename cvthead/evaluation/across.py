@@ -49,14 +49,14 @@ class Crossing:
 
 
 def crossings(bench: Bench, clips: Sequence[Clip], each: int, csim: Embed | None) -> list[Crossing]:
-    """Drive every clip's source by ``each`` frames of other clips.
+    """Drive every clip's source by ``each`` frames of other people's clips.
 
     Args:
         csim: the user's embedder, for the paper's table.
     """
     lent = [shot for clip in clips for shot in clip.lent]
     done = []
-    for number, other in pairs(len(clips), LENT, each):
+    for number, other in pairs([clip.identity for clip in clips], LENT, each):
         clip, driver = clips[number], lent[other]
         found, drawn = cross(
             bench.tracker, bench.embed, clip.source, clip.known, clip.persons, driver
@@ -84,9 +84,10 @@ def user_cosines(
 
 def scale_of(clips: Sequence[Clip]) -> Scale | None:
     """CSIM's 0 and 1; None without an embedder or with a single person."""
-    known = [clip.known for clip in clips if clip.known is not None]
+    # One embedding each: two clips of one person would count that person as different people.
+    known = {clip.identity: clip.known for clip in reversed(clips) if clip.known is not None}
     same = [cosine for clip in clips for cosine in clip.same]
-    return Scale.of(same, known) if len(known) > 1 else None
+    return Scale.of(same, list(known.values())) if len(known) > 1 else None
 
 
 def cross_tables(

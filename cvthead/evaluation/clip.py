@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from cvthead.deformation import DeformationModel
 from cvthead.errors import FaceError
 from cvthead.evaluation.big_pose import big_pose_pairs
 from cvthead.evaluation.identity import Embed, Vector
 from cvthead.evaluation.methods import BALD, Method, Person
-from cvthead.evaluation.metrics import Metrics
+from cvthead.evaluation.metrics import Metrics, Score
 from cvthead.evaluation.motion import Motion
 from cvthead.evaluation.page import Grid, Rows
 from cvthead.evaluation.reenactment import Reenactment, followed, picture, reenact
 from cvthead.evaluation.shots import Shot, Take, read_take
 from cvthead.evaluation.steadiness import Steadiness, follow_all, steadiness
-from cvthead.evaluation.two_sources import Likeness, likeness
+from cvthead.evaluation.two_sources import likeness
 from cvthead.evaluation.unseen import visibility
+from cvthead.evaluation.videos import Video
 from cvthead.points import PointLayout
 from cvthead.tracking.tracker import TrackedFace, Tracker
 
@@ -66,6 +66,7 @@ class Clip:
     """Figures of one clip, and what the measures across clips need of it.
 
     Attributes:
+        identity: whose face it shows.
         source: the first frame in which a face can be tracked.
         persons: made of it, without the bald mesh.
         lent: frames that drive other people, tracked with their own shape.
@@ -79,6 +80,7 @@ class Clip:
         grids: pictures for the page.
     """
 
+    identity: str
     source: Shot
     persons: Mapping[str, Person]
     lent: Sequence[Shot]
@@ -89,17 +91,17 @@ class Clip:
     far: Sequence[Reenactment]
     far_found: int
     steadiness: Steadiness | None
-    likeness: Mapping[str, Likeness] | None
+    likeness: Mapping[str, Score] | None
     grids: Mapping[str, Grid]
 
 
-def measure_clip(bench: Bench, path: Path) -> Clip | None:
+def measure_clip(bench: Bench, video: Video) -> Clip | None:
     """Measure one clip; None if its face cannot be tracked in two frames.
 
     Raises:
         VideoError: the file cannot be read.
     """
-    take = read_take(bench.tracker, path)
+    take = read_take(bench.tracker, video.path, video.name)
     if take is None:
         return None
     numbers = take.spread(bench.drivers)
@@ -122,6 +124,7 @@ def measure_clip(bench: Bench, path: Path) -> Clip | None:
         same = [float(known @ bench.embed(one.image, one.face)) for one in drivers]
     lent = (drivers[len(drivers) // 2], drivers[-1])[-LENT:]
     return Clip(
+        video.identity,
         source,
         persons,
         lent,
@@ -185,7 +188,7 @@ def _likeness(
     persons: Mapping[str, Person],
     drivers: Sequence[Shot],
     grids: dict[str, Grid],
-) -> Mapping[str, Likeness] | None:
+) -> Mapping[str, Score] | None:
     middle = take.driver(bench.tracker, len(take.frames) // 2)
     if middle is None or (others := bench.persons(middle)) is None:
         return None

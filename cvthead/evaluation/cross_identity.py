@@ -45,19 +45,21 @@ class Found:
     cosine: float | None
 
 
-def pairs(count: int, drivers: int, each: int) -> list[tuple[int, int]]:
-    """For each of ``count`` sources, ``each`` drivers of other people, drawn with SEED.
+def pairs(identities: Sequence[str], drivers: int, each: int) -> list[tuple[int, int]]:
+    """For each clip's source, ``each`` drivers of other people, drawn with SEED.
 
     Args:
-        drivers: drivers per person; number d belongs to person ``d // drivers``.
+        identities: of the clips.
+        drivers: drivers per clip; number d belongs to clip ``d // drivers``.
 
     Returns:
         (source, driver) numbers.
     """
     rng = np.random.default_rng(SEED)
     chosen = []
-    for source in range(count):
-        others = [d for d in range(count * drivers) if d // drivers != source]
+    owners = [identity for identity in identities for _ in range(drivers)]
+    for source, identity in enumerate(identities):
+        others = [number for number, owner in enumerate(owners) if owner != identity]
         picked = rng.permutation(others)[:each]
         chosen += [(source, int(driver)) for driver in picked]
     return chosen

@@ -116,8 +116,8 @@ def group_tables(done: Sequence[Reconstruction], tried: int) -> list[Table]:
     ]
 
 
-def rows_of(done: Sequence[Reconstruction], name: str) -> dict[str, list[float]]:
-    rows = {}
+def rows_of(done: Sequence[Reconstruction], name: str) -> dict[str, list[float | None]]:
+    rows: dict[str, list[float | None]] = {}
     for group in [*sorted({one.group for one in done}), ALL]:
         chosen = [one for one in done if group in (ALL, one.group)]
         same = mean([one.same[name] for one in chosen])

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -36,14 +37,14 @@ class Score:
     Attributes:
         l1: mean absolute difference over the person's pixels, 0..1.
         psnr: dB over all valid pixels, at most ``PSNR_CAP``.
-        st_lpips: shift-tolerant LPIPS, AlexNet, spatial mean.
+        st_lpips: shift-tolerant LPIPS, AlexNet, spatial mean; None without its weights.
         ms_ssim: multi-scale structural similarity, at most 1.
         lpips: the user's own LPIPS network; None without one.
     """
 
     l1: float
     psnr: float
-    st_lpips: float
+    st_lpips: float | None
     ms_ssim: float
     lpips: float | None = None
 
@@ -65,15 +66,15 @@ def l1(result: Picture, target: Picture, mask: Picture, valid: NDArray[np.bool_]
 
 def psnr(result: Picture, target: Picture, valid: NDArray[np.bool_]) -> float:
     """Peak signal-to-noise ratio in dB over the valid pixels, peak 1, capped at PSNR_CAP."""
-    error = float(np.square((result - target)[valid], dtype=np.float64).mean())
-    return min(PSNR_CAP, -10 * float(np.log10(max(error, 1e-12))))
+    return min(PSNR_CAP, cv2.PSNR(result[valid], target[valid], 1.0))
 
 
 def ms_ssim(a: Tensor, b: Tensor) -> Tensor:
     """Multi-scale SSIM of (B, C, H, W) pictures in 0..1, sides above 160: (B,).
 
     Five scales, 11-tap Gaussian windows (sigma 1.5) that lie wholly inside the picture,
-    average over channels at the end.
+    average over channels at the end. torchmetrics averages the channels before it multiplies the
+    scales, and reflects the borders of the last one, which changes up to several hundredths.
     """
     taps = torch.exp(
         -((torch.arange(WINDOW, dtype=torch.float64) - WINDOW // 2) ** 2) / (2 * SIGMA**2)
@@ -151,13 +152,12 @@ class Metrics:
     def __init__(
         self, perceptual: STLPIPS | None = None, lpips: PictureNetwork | None = None
     ) -> None:
-        """Raises AssetError if the weights of ST-LPIPS cannot be had.
-
-        Args:
-            perceptual: None takes the AlexNet of the registry's wheel.
-            lpips: the user's; takes two batches of pictures.
         """
-        self.perceptual = perceptual or STLPIPS("alex")
+        Args:
+            perceptual: without it, ST-LPIPS is absent.
+            lpips: the user's; takes two batches of pictures. Without it, LPIPS is absent.
+        """
+        self.perceptual = perceptual
         self.lpips = lpips
 
     @torch.no_grad()
@@ -178,7 +178,7 @@ class Metrics:
         """
         filled = [np.where(valid[..., None], result, target) for result in results]
         batch, goal = tensor(filled), tensor([target])
-        distance = self.perceptual(batch * 2 - 1, goal * 2 - 1)
+        distance = self.perceptual(batch * 2 - 1, goal * 2 - 1) if self.perceptual else None
         similarity = ms_ssim(batch, goal.expand_as(batch))
         lpips = None
         if self.lpips:
@@ -188,7 +188,7 @@ class Metrics:
             Score(
                 l1(result, target, mask, valid),
                 psnr(result, target, valid),
-                float(distance[i]),
+                None if distance is None else float(distance[i]),
                 float(similarity[i]),
                 None if lpips is None else float(lpips[i].mean()),
             )

@@ -24,8 +24,14 @@ from cvthead.evaluation.speed import PUBLISHED_FPS
 from cvthead.evaluation.table import Table
 
 COLUMNS = {"FID ↓": ".2f", "CSIM ↑": ".3f", "IQA ↑": ".2f", "FPS ↑": ".1f"}
+# The paper's table 2.
 PUBLISHED: dict[str, tuple[float | None, ...]] = {
+    "FOMM, paper, VoxCeleb1": (39.69, 0.592, 37.00, 64.3),
+    "Bi-Layer, paper, VoxCeleb1": (43.8, 0.697, 41.4, 20.1),
+    "ROME, paper, VoxCeleb1": (29.23, 0.717, 39.11, 12.9),
     "CVTHead, paper, VoxCeleb1": (25.78, 0.675, 42.26, PUBLISHED_FPS),
+    "FOMM, paper, VoxCeleb2": (61.28, 0.624, 36.20, 64.3),
+    "ROME, paper, VoxCeleb2": (53.52, 0.729, 37.34, 12.9),
     "CVTHead, paper, VoxCeleb2": (48.48, 0.712, 40.27, PUBLISHED_FPS),
 }
 

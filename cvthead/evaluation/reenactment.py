@@ -24,9 +24,14 @@ SCORES = {"L1 ↓": ".4f", "PSNR ↑": ".2f", "ST-LPIPS ↓": ".4f", "MS-SSIM �
 PAPER_SCORES = {"L1 ↓": ".3f", "PSNR ↑": ".2f", "LPIPS ↓": ".3f", "MS-SSIM ↑": ".3f"}
 # The paper's table 1 and its ablations: other people, cropped otherwise.
 PUBLISHED: dict[str, tuple[float | None, ...]] = {
+    "FOMM, paper, VoxCeleb1": (0.048, 22.43, 0.139, 0.836),
+    "Bi-Layer, paper, VoxCeleb1": (0.050, 21.48, 0.108, 0.839),
+    "ROME, paper, VoxCeleb1": (0.048, 21.13, 0.116, 0.838),
     "CVTHead, paper, VoxCeleb1": (0.041, 22.09, 0.111, 0.840),
     "no deformation, paper, VoxCeleb1": (0.041, 22.47, 0.121, 0.842),
     "pixel-aligned, paper, VoxCeleb1": (0.045, 21.81, 0.107, 0.841),
+    "FOMM, paper, VoxCeleb2": (0.059, 20.93, 0.165, 0.793),
+    "ROME, paper, VoxCeleb2": (0.050, 20.75, 0.117, 0.834),
     "CVTHead, paper, VoxCeleb2": (0.042, 21.37, 0.119, 0.841),
 }
 PARTS = {

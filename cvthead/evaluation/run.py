@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from cvthead.errors import FaceError, InputError
+from cvthead.data.layout import Split
+from cvthead.errors import FaceError, InputError, VideoError
 from cvthead.evaluation.across import CROSS, cross_tables
 from cvthead.evaluation.big_pose import DEGREES
 from cvthead.evaluation.clip import Bench, Clip, measure_clip
@@ -35,6 +36,7 @@ from cvthead.evaluation.steadiness import STRETCH, steadiness_table
 from cvthead.evaluation.sweep import sweep
 from cvthead.evaluation.table import Table
 from cvthead.evaluation.two_sources import likeness_table
+from cvthead.evaluation.videos import find_videos
 from cvthead.files import write_file
 from cvthead.head.arkit import ArkitMap
 from cvthead.preset import Preset
@@ -46,7 +48,7 @@ SOURCES, GROUPS, SWEEP = "Two sources of one person", "Groups", "Sweep"
 # Of the parts that can come to nothing: heading, and why.
 NOTHING = {
     "big": (BIG, f"no clip has two frames more than {DEGREES:.0f} degrees apart"),
-    "cross": (CROSS, "it takes two clips with a trackable face"),
+    "cross": (CROSS, "it takes clips of two people with a trackable face"),
     "steady": (STEADY, f"no clip shows a trackable face in {STRETCH} frames in a row"),
     "sources": (SOURCES, "no clip shows a trackable face in its middle frame"),
     "groups": (GROUPS, "the data holds no stills.csv, or no still of its split val is trackable"),
@@ -58,7 +60,8 @@ class Plan:
     """How much is measured.
 
     Attributes:
-        data: folder with clips/val and stills/val.
+        data: folder with clips/val and stills/val, or of videos.
+        split: see cvthead.evaluation.videos.find_videos.
         output: folder for the report and the page.
         every: take every n-th clip and still.
         crossings: drivers of other people per source.
@@ -67,6 +70,7 @@ class Plan:
     """
 
     data: Path
+    split: Split | None
     output: Path
     every: int
     crossings: int
@@ -83,7 +87,8 @@ def evaluate(
         pipelines: whose speed is measured, by method.
 
     Raises:
-        InputError: no clips, none in which a face can be tracked, or a damaged table of stills.
+        InputError: as find_videos, no clip in which a face can be tracked, or a damaged table of
+            stills.
     """
     seconds: dict[str, float] = {}
     stills = read_stills(plan.data) if "groups" in bench.parts else []
@@ -126,25 +131,28 @@ def timed(seconds: dict[str, float], part: str, work: Callable[[], T]) -> T:
 
 
 def measure_clips(bench: Bench, plan: Plan) -> list[Clip]:
-    """Every n-th clip; those without a trackable face are left out.
+    """Every n-th clip; those that cannot be read or show no trackable face are left out.
 
     Raises:
-        InputError: none is left.
+        InputError: as find_videos, or none is left.
     """
-    folder = plan.data / "clips" / "val"
-    paths = sorted(folder.glob("*.mp4"))[:: plan.every]
+    videos = find_videos(plan.data, plan.split)[:: plan.every]
     # Pictures fill the memory; only those of the people on the page are kept.
-    shown = set(spread(paths, plan.people))
+    shown = set(spread(videos, plan.people))
     clips = []
-    for path in tqdm(paths, desc="clips", unit="clip"):
-        clip = measure_clip(bench, path)
+    for video in tqdm(videos, desc="clips", unit="clip"):
+        try:
+            clip = measure_clip(bench, video)
+        except VideoError as error:
+            tqdm.write(f"{video.path}: {error}")
+            continue
         if clip is None:
-            tqdm.write(f"{path.name}: no trackable face")
+            tqdm.write(f"{video.path}: no trackable face")
         else:
-            clips.append(clip if path in shown else replace(clip, grids=big_only(clip.grids)))
+            clips.append(clip if video in shown else replace(clip, grids=big_only(clip.grids)))
     if not clips:
         raise InputError(
-            f"no usable clips in {folder}", hint="pass the folder with clips/val/*.mp4"
+            f"no usable clips in {plan.data}", hint="pass videos that show a face in two frames"
         )
     return clips
 
@@ -179,7 +187,7 @@ def clip_sections(bench: Bench, clips: Sequence[Clip]) -> dict[str, list[Table]]
     far = [one for clip in clips for one in clip.far]
     if far:
         found = sum(clip.far_found for clip in clips)
-        people = len({one.clip for one in far})
+        people = len({clip.identity for clip in clips if clip.far})
         caption = (
             f"Source and driver more than {DEGREES:.0f} degrees apart: {len(far)} pairs of "
             f"{people} people, evenly spread over the {found} that were found."
@@ -259,7 +267,9 @@ def absent(parts: Collection[str], sections: Mapping[str, Sequence[Table]]) -> d
 
 def about(bench: Bench, clips: Sequence[Clip]) -> list[str]:
     frames = sum(len(clip.reenacted) for clip in clips)
+    people = len({clip.identity for clip in clips})
+    shared = f" of {people} people" if people < len(clips) else ""
     return [
-        f"{len(clips)} clips, {frames} driving frames. Source: first trackable frame of the clip. "
-        "256 x 256 crop of 0.36 m; ST-LPIPS: AlexNet, spatial mean."
+        f"{len(clips)} clips{shared}, {frames} driving frames. Source: first trackable "
+        "frame of the clip. 256 x 256 crop of 0.36 m; ST-LPIPS: AlexNet, spatial mean."
     ]

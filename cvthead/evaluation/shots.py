@@ -25,7 +25,7 @@ class Shot:
     """One picture of a person.
 
     Attributes:
-        name: of the clip or still, fit for a file name.
+        name: of the clip or still.
         number: of the frame, 0 for a still.
         image: (H, W, 3) uint8 RGB, the whole picture.
         face: tracked in it.
@@ -44,7 +44,7 @@ class Take:
     """A clip read into memory.
 
     Attributes:
-        name: of the file without its suffix.
+        name: of its own among the clips that are measured.
         frames: all of them.
         source: the first frame in which a face can be tracked.
     """
@@ -69,7 +69,7 @@ class Take:
         return [int(number) for number in np.unique(numbers)[1:]]
 
 
-def read_take(tracker: Tracker, path: Path) -> Take | None:
+def read_take(tracker: Tracker, path: Path, name: str) -> Take | None:
     """Read a clip; None if no face can be tracked in it.
 
     Raises:
@@ -77,9 +77,9 @@ def read_take(tracker: Tracker, path: Path) -> Take | None:
     """
     frames = [frame.rgb for frame in read_frames(path)]
     for number, frame in enumerate(frames):
-        source = shoot(tracker, path.stem, number, frame)
+        source = shoot(tracker, name, number, frame)
         if source is not None:
-            return Take(path.stem, frames, source)
+            return Take(name, frames, source)
     return None
 
 

@@ -7,13 +7,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from cvthead.evaluation.methods import Drawn, Person
-from cvthead.evaluation.metrics import Metrics, on_white
+from cvthead.evaluation.metrics import Metrics, Score, on_white
+from cvthead.evaluation.reenactment import mean
 from cvthead.evaluation.shots import Shot
 from cvthead.evaluation.table import Table
 
 COLUMNS = {"PSNR ↑": ".2f", "ST-LPIPS ↓": ".4f"}
-
-Likeness = tuple[float, float]
 
 
 def likeness(
@@ -21,8 +20,8 @@ def likeness(
     first: Mapping[str, Person],
     second: Mapping[str, Person],
     driver: Shot,
-) -> tuple[dict[str, Likeness], dict[str, tuple[Drawn, Drawn]]]:
-    """PSNR in dB and ST-LPIPS between two avatars of one person, by method.
+) -> tuple[dict[str, Score], dict[str, tuple[Drawn, Drawn]]]:
+    """The distance between two avatars of one person, by method.
 
     Each picture is composited on white by its own mask, so hair and outline count.
 
@@ -34,17 +33,15 @@ def likeness(
     for name, person in first.items():
         drawn[name] = person.follow(driver), second[name].follow(driver)
         a, b = (on_white(one.rgb, one.alpha) for one in drawn[name])
-        score = metrics.scores([a], b, driver.head.mask, everywhere)[0]
-        figures[name] = score.psnr, score.st_lpips
+        figures[name] = metrics.scores([a], b, driver.head.mask, everywhere)[0]
     return figures, drawn
 
 
-def likeness_table(done: Sequence[Mapping[str, Likeness]]) -> Table:
+def likeness_table(done: Sequence[Mapping[str, Score]]) -> Table:
     caption = (
         f"Two sources of one person: avatars of the first and the middle frame of {len(done)} "
         "clips, driven by the last one, against each other."
     )
-    rows = {
-        name: [float(np.mean([one[name][k] for one in done])) for k in (0, 1)] for name in done[0]
-    }
+    scores = {name: mean([one[name] for one in done]) for name in done[0]}
+    rows = {name: (score.psnr, score.st_lpips) for name, score in scores.items()}
     return Table("two sources", caption, COLUMNS, rows)
