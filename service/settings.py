@@ -74,7 +74,8 @@ class Settings(BaseSettings):
         0,
         ge=0,
         le=1024,
-        description="Threads of each neural network; 0 is one per core, of the open preset at most 4.",
+        description="Threads of each neural network; 0 is one per core, of the open preset at "
+        "most 4.",
     )
     providers: Names = Field(
         (),
