@@ -61,11 +61,12 @@ def test_resident_memory() -> None:
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux's /proc")
 def test_the_service_is_started_measured_and_stopped(tmp_path: Path) -> None:
-    lines = service_lines(tmp_path, renders=2)
+    lines = service_lines(tmp_path, "open", renders=2)
     patterns = [
         r"service ready after \d+\.\d s",
         r"resident when ready: \d+ MB",
         r"resident after one upload and 2 renders: \d+ MB",
+        r"highest: \d+ MB",
     ]
     for line, pattern in zip(lines, patterns, strict=True):
         assert re.fullmatch(pattern, line)
