@@ -43,6 +43,8 @@ def open_session(
     options.log_severity_level = 3
     # Threads that wait for the next run would take a core from whatever handles the result.
     options.add_session_config_entry("session.force_spinning_stop", "1")
+    if not niceness:
+        return ort.InferenceSession(network, options, providers=list(providers))
     # The helpers begin here and inherit the priority of the thread that opens the session.
     with ThreadPoolExecutor(1, initializer=lower_priority, initargs=(niceness,)) as opener:
         return opener.submit(
