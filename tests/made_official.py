@@ -23,13 +23,13 @@ from cvthead.coefficients import Coefficients
 from cvthead.official.avatar import OfficialAvatar
 from cvthead.official.crop import FaceSquare
 from cvthead.official.flame import PREFIX, from_checkpoint
-from cvthead.official.keys import released_shapes
+from cvthead.official.keys import deca_detail_shapes, released_shapes
 from cvthead.official.manifest import FILES, write_manifest
 
 Arrays = dict[str, NDArray[Any]]
 State = dict[str, Tensor]
-# Vertices and border vertices of the three levels; they give the released numbers of faces.
-LEVELS = ((5023, 68), (1256, 46), (314, 29))
+# Vertices and border vertices of the five levels; they give the released numbers of faces.
+LEVELS = ((5023, 68), (1256, 46), (314, 29), (79, 17), (20, 4))
 PARENTS = np.array([-1, 0, 1, 1, 1])
 
 
@@ -38,7 +38,9 @@ def surface(count: int, border: int) -> tuple[NDArray[np.float64], NDArray[np.ui
     angle = np.arange(border) * 2 * np.pi / border
     rim = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     inside = np.arange(count - border)
-    radius, turn = np.sqrt((inside + 0.5) / len(inside)) * 0.98, inside * np.pi * (3 - np.sqrt(5))
+    # Within the polygon of the border.
+    reach = min(0.98, np.cos(np.pi / border))
+    radius, turn = np.sqrt((inside + 0.5) / len(inside)) * reach, inside * np.pi * (3 - np.sqrt(5))
     flat = np.concatenate([np.stack([radius * np.cos(turn), radius * np.sin(turn)], axis=1), rim])
     faces = Delaunay(flat).simplices
     sides = flat[faces[:, 1:]] - flat[faces[:, :1]]
@@ -174,17 +176,34 @@ def write_parts(folder: Path, weights: State, mesh: dict[str, list[Any]], flame:
     torch.save({"model": kept}, folder / "cvthead.pt")
     torch.save(_cut(weights, "face_parsing.net."), folder / "79999_iter.pth")
     torch.save(_cut(weights, "hair_model."), folder / "linear_hair.pth")
-    torch.save({"E_flame": _cut(weights, "deca.E_flame.")}, folder / "deca_model.tar")
+    torch.save(deca(weights), folder / "deca_model.tar")
     torch.save(weights["deform_mean"], data / "mean_deform.pt")
     torch.save(weights["deform_basis"].reshape(-1, 60), data / "u_full.pt")
     tensors = {key: value.numpy() for key, value in _cut(weights, PREFIX).items()}
     write_flame(folder / flame, tensors, year=2020 if flame == "generic_model.pkl" else 2023)
+    write_landmarks(data / "landmark_embedding.npy", tensors)
+
+
+def deca(weights: State) -> dict[str, Any]:
+    """The contents of ``deca_model.tar`` as DECA's trainer writes it."""
+    networks: dict[str, Any] = {"E_flame": _cut(weights, "deca.E_flame.")}
+    for key, shape in deca_detail_shapes().items():
+        entry, name = key.split(".", 1)
+        networks.setdefault(entry, {})[name] = torch.zeros(()).expand(shape)
+    return networks | {"opt": {"state": {}, "param_groups": [{"lr": 1e-4}]}, "global_step": 5}
+
+
+def write_landmarks(path: Path, tensors: Arrays) -> None:
+    """``landmark_embedding.npy``, the contour's tables as PyTorch tensors like the released."""
     embedding = {
+        "static_lmk_faces_idx": tensors["lmk_faces_idx"],
+        "static_lmk_bary_coords": tensors["lmk_bary_coords"],
+        "dynamic_lmk_faces_idx": torch.from_numpy(tensors["dynamic_lmk_faces_idx"]),
+        "dynamic_lmk_bary_coords": torch.from_numpy(tensors["dynamic_lmk_bary_coords"]),
         "full_lmk_faces_idx": tensors["full_lmk_faces_idx"],
         "full_lmk_bary_coords": tensors["full_lmk_bary_coords"],
-        "dynamic_lmk_faces_idx": torch.zeros(79, 17, dtype=torch.int64),
     }
-    np.save(data / "landmark_embedding.npy", np.array(embedding, dtype=object), allow_pickle=True)
+    np.save(path, np.array(embedding, dtype=object), allow_pickle=True)
 
 
 def write_flame(path: Path, tensors: Arrays, *, year: int) -> None:

@@ -8,6 +8,7 @@ import pickle
 import pickletools
 import shutil
 from pathlib import Path
+from typing import Any
 
 import made_official
 import numpy as np
@@ -15,11 +16,18 @@ import pytest
 import torch
 from made_official import earlier_import
 from safetensors.torch import load_file
+from scipy.sparse import csc_matrix
 from torch import Tensor
 
 from cvthead.cli.main import main
 from cvthead.errors import AssetError, InputError
-from cvthead.official.flame import from_checkpoint, from_files
+from cvthead.official.flame import (
+    Flame,
+    from_checkpoint,
+    from_files,
+    read_landmarks,
+    read_model,
+)
 from cvthead.official.importer import import_official, read_release
 from cvthead.official.keys import part, released_shapes
 from cvthead.official.manifest import (
@@ -30,6 +38,7 @@ from cvthead.official.manifest import (
     WEIGHTS,
     Manifest,
 )
+from cvthead.official.mesh import read_hierarchy
 from cvthead.official.pipeline import OfficialPipeline
 
 PORTRAIT = Path(__file__).parents[1] / "examples" / "astronaut.png"
@@ -66,11 +75,8 @@ def test_separate_files_give_the_same_model(folder: Path, tmp_path: Path) -> Non
     shutil.rmtree(tmp_path)
 
 
-def landmarks_file(folder: Path) -> Path:
-    tensors = made_official.flame_state()
-    embedding = np.array({k: tensors[k] for k in tensors if k.startswith("full")}, dtype=object)
-    np.save(folder / "landmarks.npy", embedding, allow_pickle=True)
-    return folder / "landmarks.npy"
+def read_flame(model: Path, landmarks: Path) -> Flame:
+    return from_files(read_model(model), read_landmarks(landmarks))
 
 
 @pytest.mark.parametrize("year", [2020, 2023])
@@ -78,7 +84,8 @@ def test_flame_2020_and_2023(year: int, tmp_path: Path) -> None:
     """Both layouts give the tables that the checkpoint would have had."""
     tensors = made_official.flame_state()
     made_official.write_flame(tmp_path / "flame.pkl", tensors, year=year)
-    found = from_files(tmp_path / "flame.pkl", landmarks_file(tmp_path)).arrays()
+    made_official.write_landmarks(tmp_path / "landmarks.npy", tensors)
+    found = read_flame(tmp_path / "flame.pkl", tmp_path / "landmarks.npy").arrays()
     for key, value in from_checkpoint(tensors).arrays().items():
         assert np.array_equal(found[key], value), key
 
@@ -87,7 +94,7 @@ def test_the_released_landmark_file(shared: Path, tmp_path: Path) -> None:
     """It also holds PyTorch tensors, which are not wanted and not loaded."""
     made_official.write_flame(tmp_path / "flame.pkl", made_official.flame_state(), year=2020)
     released = shared / "reference" / "official-data" / "landmark_embedding.npy"
-    found = from_files(tmp_path / "flame.pkl", released)
+    found = read_flame(tmp_path / "flame.pkl", released)
     assert len(np.unique(found.landmark_faces)) > 60
     np.testing.assert_allclose(found.landmark_bary.sum(axis=1), 1, atol=1e-6)
 
@@ -105,25 +112,64 @@ def test_the_layouts_differ_as_the_files_do(tmp_path: Path) -> None:
     assert not [argument for _, argument in new if "chumpy" in str(argument)]
 
 
-@pytest.mark.parametrize(
-    ("entry", "shape", "message"),
-    [
-        ("shapedirs", (5023, 3, 150), "bases of shape"),
-        ("v_template", (4000, 3), r"template has shape \(4000, 3\)"),
-        ("weights", (5023, 3), "weights has shape"),
-        ("J_regressor", (4, 5023), "joint_regressor has shape"),
-        ("kintree_table", (2, 24), "joints are not global, neck, jaw and two eyes"),
-        ("f", (3, 3), "faces has shape"),
-    ],
-)
-def test_another_head_model_is_refused(
-    entry: str, shape: tuple[int, ...], message: str, tmp_path: Path
-) -> None:
+def test_everything_wrong_with_a_head_model_is_named(tmp_path: Path) -> None:
     path = tmp_path / "flame.pkl"
     made_official.write_flame(path, made_official.flame_state(), year=2023)
-    path.write_bytes(pickle.dumps(pickle.loads(path.read_bytes()) | {entry: np.zeros(shape)}))
-    with pytest.raises(AssetError, match=message):
-        from_files(path, landmarks_file(tmp_path))
+    tables = pickle.loads(path.read_bytes())
+    del tables["posedirs"]
+    tables["v_template"][7] = np.nan
+    tables["f"][3] = 5023
+    tables |= {"shapedirs": np.zeros((5023, 3, 150)), "weights": "none", "J_regressor": [1, 2]}
+    tables["kintree_table"] = np.zeros((2, 5), np.int64)
+    path.write_bytes(pickle.dumps(tables))
+    with pytest.raises(AssetError) as caught:
+        read_model(path)
+    assert str(caught.value).split("(7 differences): ")[1].split("; ") == [
+        "posedirs is missing",
+        "shapedirs has shape (5023, 3, 150), not (5023, 3, 400)",
+        "J_regressor has shape (), not (5, 5023)",
+        "weights has shape (), not (5023, 5)",
+        "f points outside 0..5022",
+        "v_template holds NaN or infinity",
+        "the joints are not global, neck, jaw and two eyes",
+    ]
+
+
+def test_everything_wrong_with_a_landmark_file_is_named(tmp_path: Path) -> None:
+    # As an array it is expected, as a tensor not read.
+    tensors: dict[str, Any] = made_official.flame_state()
+    tensors["full_lmk_faces_idx"] = torch.zeros(1, 68)
+    tensors["lmk_bary_coords"] = np.zeros((50, 3))
+    made_official.write_landmarks(tmp_path / "landmarks.npy", tensors)
+    with pytest.raises(AssetError) as caught:
+        read_landmarks(tmp_path / "landmarks.npy")
+    assert str(caught.value).split("(2 differences): ")[1].split("; ") == [
+        "static_lmk_bary_coords has shape (50, 3), not (51, 3)",
+        "full_lmk_faces_idx has shape (), not (1, 68)",
+    ]
+
+
+def test_everything_wrong_with_the_transforms_is_named(tmp_path: Path) -> None:
+    """Also of the levels that the network does not use."""
+    tables = made_official.tables()
+    del tables["vertices"][4]
+    tables["face"][3] = tables["face"][3][:-1]
+    tables["face"][0][5] = 5023
+    tables["down_transform"][0] = tables["down_transform"][0] * 2
+    tables["up_transform"][1] = csc_matrix((1256, 314))
+    tables["up_transform"].append(csc_matrix((20, 5)))
+    path = tmp_path / "transform.pkl"
+    path.write_bytes(pickle.dumps(tables))
+    with pytest.raises(AssetError) as caught:
+        read_hierarchy(path)
+    assert str(caught.value).split("(6 differences): ")[1].split("; ") == [
+        "vertices[4] is missing",
+        "up_transform[4] is unknown",
+        "face[3] has shape (138, 3), not (139, 3)",
+        "face[0] points outside 0..5022",
+        "down_transform[0] does not select one vertex a row",
+        "up_transform[1] does not weigh 3 vertices a row",
+    ]
 
 
 def small_release(folder: Path) -> Path:
@@ -231,6 +277,80 @@ def test_a_wrong_separate_file(tmp_path: Path) -> None:
     torch.save(hair, tmp_path / "linear_hair.pth")
     with pytest.raises(AssetError, match=r"linear_hair.*fc\.weight has shape \(61, 2048\)"):
         import_official(tmp_path, tmp_path / "model")
+
+
+def test_decas_other_networks_are_checked_where_they_are(tmp_path: Path) -> None:
+    release(tmp_path, {k: v for k, v in blanks().items() if not k.startswith("deca.E_flame.")})
+    contents = made_official.deca(blanks())
+    del contents["E_detail"], contents["D_detail"]["l1.0.bias"]
+    contents["E_flame"]["layers.2.bias"] = torch.zeros(235)
+    torch.save(contents, tmp_path / "deca_model.tar")
+    with pytest.raises(AssetError) as caught:
+        import_official(tmp_path, tmp_path / "model")
+    listed = str(caught.value)
+    for line in (
+        "deca_model.tar is not the released file (2 differences)",
+        "D_detail.l1.0.bias is missing",
+        "E_flame.layers.2.bias has shape (235,), not (236,)",
+    ):
+        assert line in listed
+
+
+def test_the_problems_of_all_files_are_listed_in_one_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kept = ("ae_proj.", "patch_to_embedding.", "vtx_", "transformer.", "unet_generator.", "pos_")
+    weights = {key: value for key, value in blanks().items() if key.startswith(kept)}
+    del weights["ae_proj.bias"]
+    release(tmp_path, weights)
+    (tmp_path / "79999_iter.pth").write_bytes(b"damaged")
+    torch.save({"fc.weight": torch.zeros(1)}, tmp_path / "linear_hair.pth")
+    torch.save({"E_flame": {"epoch": 3}}, tmp_path / "deca_model.tar")
+    torch.save({"model": torch.zeros(1)}, tmp_path / "mean_deform.pt")
+    (tmp_path / "generic_model.pkl").write_bytes(pickle.dumps(["no tables"]))
+    np.save(tmp_path / "landmark_embedding.npy", np.zeros(3))
+    (tmp_path / "transform.pkl").write_bytes(pickle.dumps({"face": Call()}))
+    with pytest.raises(AssetError) as caught:
+        import_official(tmp_path, tmp_path / "model")
+    first, *problems = str(caught.value).splitlines()
+    assert first == f"10 problems with the files in {tmp_path}:"
+    for problem, (name, what) in zip(
+        problems,
+        (
+            ("cvthead.pt", "(1 difference): ae_proj.bias is missing"),
+            ("79999_iter.pth", "is refused: Unsupported operand"),
+            ("linear_hair.pth", "(320 differences): conv1.weight is missing; "),
+            ("deca_model.tar", "holds no named tensors under epoch"),
+            ("rome.pth", "is not in"),
+            ("mean_deform.pt", "holds no tensor"),
+            ("u_full.pt", "is not in"),
+            ("generic_model.pkl", "holds no named tables"),
+            ("landmark_embedding.npy", "no single object"),
+            ("transform.pkl", "it names posix.system"),
+        ),
+        strict=True,
+    ):
+        assert name in problem
+        assert what in problem
+    assert main(["import-official", str(tmp_path), "-o", str(tmp_path / "model")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert all(f"({number}) " in line for number in range(1, 11))
+    assert not (tmp_path / "model").exists()
+
+
+def test_without_a_checkpoint_the_other_files_are_still_checked(tmp_path: Path) -> None:
+    """Those that are not there may not be needed: that is the checkpoint's to say."""
+    torch.save({"fc.weight": torch.zeros(1)}, tmp_path / "linear_hair.pth")
+    (tmp_path / "generic_model.pkl").write_bytes(b"damaged")
+    with pytest.raises(AssetError) as caught:
+        import_official(tmp_path, tmp_path / "model")
+    _, *problems = str(caught.value).splitlines()
+    for problem, what in zip(
+        problems,
+        ("cvthead.pt is not in", "fc.bias is missing", "is refused", "transform.pkl is not in"),
+        strict=True,
+    ):
+        assert what in problem
 
 
 class Call:

@@ -16,16 +16,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvthead.coefficients import EXPRESSION_SIZE, POSE_SIZE, SHAPE_SIZE
-from cvthead.errors import AssetError
 from cvthead.head.model import JOINT_COUNT, PARENTS, POSE_FEATURES, HeadModel, Region
-from cvthead.official.keys import part
-from cvthead.official.unpickle import HINT, load_npy, load_pickle
+from cvthead.official.keys import dense, part, refuse, table_problems
+from cvthead.official.unpickle import load_npy, load_pickle, named_tables
 
 PREFIX = "deca.flame."
 EXPRESSION_START = 300  # columns of shapedirs before it are shape
 LANDMARKS = 68
+SKELETON = "the joints are not global, neck, jaw and two eyes"
 FOREHEAD = 0.4  # height above the brows, as a share of that between chin and brows
+# What the released code reads of FLAME's own file.
+MODEL_SHAPES = {
+    "f": (9976, 3),
+    "v_template": (5023, 3),
+    "shapedirs": (5023, 3, 400),
+    "posedirs": (5023, 3, POSE_FEATURES),
+    "J_regressor": (JOINT_COUNT, 5023),
+    "weights": (5023, JOINT_COUNT),
+    "kintree_table": (2, JOINT_COUNT),
+}
+LANDMARK_SHAPES = {
+    "static_lmk_faces_idx": (51,),
+    "static_lmk_bary_coords": (51, 3),
+    "dynamic_lmk_faces_idx": (79, 17),
+    "dynamic_lmk_bary_coords": (79, 17, 3),
+    "full_lmk_faces_idx": (1, LANDMARKS),
+    "full_lmk_bary_coords": (1, LANDMARKS, 3),
+}
 # The released landmark file keeps the contour's tables as PyTorch tensors; nothing needs them.
+CONTOUR = ("dynamic_lmk_faces_idx", "dynamic_lmk_bary_coords")
 UNUSED_TENSORS = frozenset({"torch._utils._rebuild_tensor_v2", "torch.storage._load_from_bytes"})
 
 Array = NDArray[np.float32]
@@ -70,18 +89,8 @@ class Flame:
             "joint_regressor": (JOINT_COUNT, vertices),
             "weights": (vertices, JOINT_COUNT),
         }
-        for name, shape in expected.items():
-            if getattr(self, name).shape != shape:
-                raise AssetError(
-                    f"FLAME: {name} has shape {getattr(self, name).shape}, not {shape}", hint=HINT
-                )
-        for name, count in (("faces", vertices), ("landmark_faces", faces)):
-            table = getattr(self, name)
-            if table.min() < 0 or table.max() >= count:
-                raise AssetError(f"FLAME: {name} points outside 0..{count - 1}", hint=HINT)
-        for field in fields(self):
-            if not np.isfinite(getattr(self, field.name)).all():
-                raise AssetError(f"FLAME: {field.name} holds NaN or infinity", hint=HINT)
+        counts = {"faces": vertices, "landmark_faces": faces}
+        refuse("FLAME", table_problems(self.arrays(), expected, counts).values())
 
     def head(self) -> HeadModel:
         """As a head model without landmarks of the 478 and other parts of the open head alone."""
@@ -130,9 +139,15 @@ def from_checkpoint(state: Mapping[str, NDArray[Any]]) -> Flame:
     """From the checkpoint's entries ``deca.flame.*``, without that prefix, checked for shape.
 
     Raises:
-        AssetError: another skeleton.
+        AssetError: another skeleton, NaN, or indices that point outside; names every entry.
     """
-    _check_parents(state["parents"])
+    shapes = part(PREFIX)
+    vertices, faces = shapes["v_template"][0], shapes["faces_tensor"][0]
+    counts = {"faces_tensor": vertices, "full_lmk_faces_idx": faces}
+    problems = table_problems(state, shapes, counts)
+    if "parents" not in problems and not _is_skeleton(state["parents"]):
+        problems["parents"] = SKELETON
+    refuse("FLAME in the checkpoint", problems.values())
     neck, eyes = state["neck_pose"].reshape(3), state["eye_pose"].reshape(6)
     split = SHAPE_SIZE
     return Flame(
@@ -149,47 +164,59 @@ def from_checkpoint(state: Mapping[str, NDArray[Any]]) -> Flame:
     )
 
 
-def from_files(model: Path, landmarks: Path) -> Flame:
-    """From FLAME's model file and the released ``landmark_embedding.npy``.
+def read_model(path: Path) -> dict[str, Any]:
+    """The tables of FLAME's own file. What else it holds nothing needs.
 
     Raises:
-        AssetError: unreadable, refused by the unpickler, or not these tables.
+        AssetError: unreadable, refused by the unpickler, or not these tables; names every entry.
     """
-    stored = load_pickle(model)
-    embedding = load_npy(landmarks, ignored=UNUSED_TENSORS)
-    try:
-        _check_parents(np.asarray(stored["kintree_table"])[0])
-        basis = _dense(stored["shapedirs"])
-        poses = _dense(stored["posedirs"])
-        if basis.shape[2] < EXPRESSION_START + EXPRESSION_SIZE or poses.shape[2] != POSE_FEATURES:
-            raise ValueError(f"bases of shape {basis.shape} and {poses.shape}")
-        stop = EXPRESSION_START + EXPRESSION_SIZE
-        return Flame(
-            template=_floats(_dense(stored["v_template"])),
-            shape_basis=_floats(basis[:, :, :SHAPE_SIZE]),
-            expression_basis=_floats(basis[:, :, EXPRESSION_START:stop]),
-            pose_basis=_floats(poses.reshape(-1, POSE_FEATURES).T),
-            joint_regressor=_floats(_dense(stored["J_regressor"])),
-            weights=_floats(_dense(stored["weights"])),
-            faces=_indices(_dense(stored["f"])),
-            landmark_faces=_indices(embedding["full_lmk_faces_idx"][0]),
-            landmark_bary=_floats(embedding["full_lmk_bary_coords"][0]),
-            rest_pose=np.zeros(POSE_SIZE, np.float32),
-        )
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
-        raise AssetError(
-            f"{model} or {landmarks} is not FLAME's: {type(error).__name__} {error}", hint=HINT
-        ) from error
+    stored = named_tables(path, load_pickle(path))
+    vertices = MODEL_SHAPES["v_template"][0]
+    problems = table_problems(stored, MODEL_SHAPES, {"f": vertices}, extra=True)
+    if "kintree_table" not in problems and not _is_skeleton(dense(stored["kintree_table"])[0]):
+        problems["kintree_table"] = SKELETON
+    refuse(str(path), problems.values())
+    return stored
 
 
-def _check_parents(parents: NDArray[Any]) -> None:
+def read_landmarks(path: Path) -> dict[str, Any]:
+    """The tables of the released ``landmark_embedding.npy``, its PyTorch tensors as None.
+
+    Raises:
+        AssetError: as :func:`read_model`.
+    """
+    stored = named_tables(path, load_npy(path, ignored=UNUSED_TENSORS))
+    tensors = {key for key in CONTOUR if key in stored and stored[key] is None}
+    problems = table_problems(
+        {key: table for key, table in stored.items() if key not in tensors},
+        {key: shape for key, shape in LANDMARK_SHAPES.items() if key not in tensors},
+        {"full_lmk_faces_idx": MODEL_SHAPES["f"][0]},
+    )
+    refuse(str(path), problems.values())
+    return stored
+
+
+def from_files(stored: Mapping[str, Any], embedding: Mapping[str, Any]) -> Flame:
+    """From what :func:`read_model` and :func:`read_landmarks` gave."""
+    basis, poses = dense(stored["shapedirs"]), dense(stored["posedirs"])
+    stop = EXPRESSION_START + EXPRESSION_SIZE
+    return Flame(
+        template=_floats(dense(stored["v_template"])),
+        shape_basis=_floats(basis[:, :, :SHAPE_SIZE]),
+        expression_basis=_floats(basis[:, :, EXPRESSION_START:stop]),
+        pose_basis=_floats(poses.reshape(-1, POSE_FEATURES).T),
+        joint_regressor=_floats(dense(stored["J_regressor"])),
+        weights=_floats(dense(stored["weights"])),
+        faces=_indices(dense(stored["f"])),
+        landmark_faces=_indices(embedding["full_lmk_faces_idx"][0]),
+        landmark_bary=_floats(embedding["full_lmk_bary_coords"][0]),
+        rest_pose=np.zeros(POSE_SIZE, np.float32),
+    )
+
+
+def _is_skeleton(parents: NDArray[Any]) -> bool:
     # The root's parent is stored as -1 or as the largest unsigned number.
-    if tuple(np.asarray(parents).astype(np.int64)[1:]) != PARENTS[1:]:
-        raise AssetError("FLAME: the joints are not global, neck, jaw and two eyes", hint=HINT)
-
-
-def _dense(value: Any) -> NDArray[Any]:
-    return np.asarray(value.toarray() if hasattr(value, "toarray") else value)
+    return tuple(parents.astype(np.int64)[1:]) == PARENTS[1:]
 
 
 def _floats(value: NDArray[Any]) -> Array:

@@ -6,8 +6,7 @@ by name and shape before anything is written.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -15,15 +14,15 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from cvthead.errors import AssetError, InputError
+from cvthead.errors import InputError
 from cvthead.files import atomic_path, write_errors
 from cvthead.head.hierarchy import MeshHierarchy
-from cvthead.model.bisenet import AUXILIARY_HEADS, FaceParsing
+from cvthead.model.bisenet import AUXILIARY_HEADS
 from cvthead.model.official_keys import network_state
 from cvthead.model.paper import PaperCVTHead
 from cvthead.official import flame, torch_files
 from cvthead.official.export import export_networks
-from cvthead.official.keys import check, part, released_shapes
+from cvthead.official.keys import check, differences, part, released_shapes
 from cvthead.official.manifest import (
     DECA,
     EIGHT_BIT,
@@ -35,120 +34,18 @@ from cvthead.official.manifest import (
     PARSING,
     RECORD,
     SourceFile,
-    file_sha256,
     write_manifest,
 )
 from cvthead.official.mesh import read_hierarchy
+from cvthead.official.parts import PARTS, State
 from cvthead.official.quantise import quantise
+from cvthead.official.release import PLACES, Release
 
-State = dict[str, Tensor]
 Files = Mapping[str, Mapping[str, Tensor]]
 CHECKPOINT = "cvthead.pt"
 TABLES = "transform.pkl"
 FLAME_NAMES = ("generic_model.pkl", "flame2023.pkl", "flame2023_Open.pkl")
 LANDMARK_NAMES = ("landmark_embedding.npy",)
-PLACES = "docs/official.md says where each official file comes from"
-
-
-@dataclass(frozen=True)
-class Part:
-    """A network or table that the checkpoint may hold, or a file of its own.
-
-    Attributes:
-        prefix: of its keys in the checkpoint.
-        file: that has it otherwise.
-        read: that file -> its tensors under the checkpoint's names.
-    """
-
-    prefix: str
-    file: str
-    read: Callable[[Path], State]
-
-
-def _parsing(path: Path) -> State:
-    prefix = "face_parsing.net."
-    state = torch_files.load_state(path)
-    check(str(path), state, part(prefix))
-    normalisation = FaceParsing()
-    return {
-        "face_parsing.mean": normalisation.mean,
-        "face_parsing.std": normalisation.std,
-        **_prefixed(prefix, state),
-    }
-
-
-def _hair(path: Path) -> State:
-    state = torch_files.load_state(path)
-    check(str(path), state, part("hair_model."))
-    return _prefixed("hair_model.", state)
-
-
-def _deca(path: Path) -> State:
-    state = torch_files.load_state(path, "E_flame")
-    check(str(path), state, part("deca.E_flame."))
-    return _prefixed("deca.E_flame.", state)
-
-
-def _rome(path: Path) -> State:
-    """ROME's image encoder; the file holds ROME's other networks too."""
-    expected = part("autoencoder.")
-    state = torch_files.load_state(path)
-    named = {
-        key.replace("autoencoder.", ""): value
-        for key, value in state.items()
-        if "autoencoder" in key
-    }
-    check(str(path), named, expected, extra=True)
-    return _prefixed("autoencoder.", {key: named[key] for key in expected})
-
-
-def _deform_mean(path: Path) -> State:
-    state = {"deform_mean": torch_files.load_tensor(path)}
-    check(str(path), state, {"deform_mean": released_shapes()["deform_mean"]})
-    return state
-
-
-def _deform_basis(path: Path) -> State:
-    vertices, axes, size = released_shapes()["deform_basis"]
-    state = {"deform_basis": torch_files.load_tensor(path)}
-    check(str(path), state, {"deform_basis": (vertices * axes, size)})
-    return {"deform_basis": state["deform_basis"].reshape(vertices, axes, size)}
-
-
-PARTS = (
-    Part("face_parsing.", "79999_iter.pth", _parsing),
-    Part("hair_model.", "linear_hair.pth", _hair),
-    Part("deca.E_flame.", "deca_model.tar", _deca),
-    Part("autoencoder.", "rome.pth", _rome),
-    Part("deform_mean", "mean_deform.pt", _deform_mean),
-    Part("deform_basis", "u_full.pt", _deform_basis),
-)
-
-
-@dataclass
-class _Folder:
-    """The user's folder; remembers what was taken from it."""
-
-    path: Path
-    used: dict[Path, list[str]] = field(default_factory=dict)
-
-    def find(self, names: tuple[str, ...], purpose: str) -> Path:
-        """The file of one of these names, at any depth, the least deep first."""
-        found = [path for name in names for path in self.path.rglob(name) if path.is_file()]
-        if not found:
-            raise AssetError(
-                f"{' or '.join(names)} is not in {self.path}; it is needed for {purpose}",
-                hint=PLACES,
-            )
-        chosen = min(found, key=lambda path: (len(path.parts), str(path)))
-        self.used.setdefault(chosen, []).append(purpose)
-        return chosen
-
-    def sources(self) -> tuple[SourceFile, ...]:
-        return tuple(
-            SourceFile(str(path.relative_to(self.path)), file_sha256(path), tuple(purposes))
-            for path, purposes in self.used.items()
-        )
 
 
 def import_official(
@@ -195,11 +92,15 @@ def read_release(source: Path) -> tuple[Files, tuple[SourceFile, ...]]:
     Raises:
         AssetError: as :func:`import_official`.
     """
-    folder = _Folder(source)
-    state = _complete_state(folder)
-    tables = _flame(folder, state)
-    hierarchy = read_hierarchy(folder.find((TABLES,), "mesh hierarchy"))
-    return _converted(state, tables, hierarchy), folder.sources()
+    release = Release(source)
+    state = _complete_state(release)
+    tables = _flame(release, state)
+    hierarchy = release.read((TABLES,), "mesh hierarchy", read_hierarchy)
+    release.refuse()
+    assert state is not None
+    assert tables is not None
+    assert hierarchy is not None
+    return _converted(state, tables, hierarchy), release.sources()
 
 
 def write_model(folder: Path, files: Files, sources: tuple[SourceFile, ...]) -> None:
@@ -233,27 +134,50 @@ def check_output(output: Path, *, replace: bool) -> None:
         )
 
 
-def _complete_state(folder: _Folder) -> State:
-    """The checkpoint, with the parts it lacks taken from their own files."""
-    path = folder.find((CHECKPOINT,), "CVTHead")
-    state = torch_files.load_state(path, "model")
+def _complete_state(release: Release) -> State | None:
+    """The checkpoint, with the parts it lacks taken from their own files.
+
+    Returns:
+        None if there is no readable checkpoint. What it holds is not known then, so of the
+        separate files only those that are there are checked.
+    """
+    path = release.find((CHECKPOINT,), "CVTHead")
+    stored = release.attempt(lambda: torch_files.load_state(path, "model")) if path else None
+    state = stored or {}
     absent = [p for p in PARTS if not any(key.startswith(p.prefix) for key in state)]
-    lacking = tuple(p.prefix for p in absent)
-    if not any(key.startswith(flame.PREFIX) for key in state):
-        lacking += (flame.PREFIX,)
-    expected = {k: s for k, s in released_shapes().items() if not k.startswith(lacking or ("\0",))}
-    check(str(path), state, expected)
+    if stored is None:
+        absent = [p for p in absent if release.has(p.file)]
+    else:
+        lacking = tuple(p.prefix for p in absent)
+        if not any(key.startswith(flame.PREFIX) for key in state):
+            lacking += (flame.PREFIX,)
+        shapes = released_shapes().items()
+        expected = {key: shape for key, shape in shapes if not key.startswith(lacking or ("\0",))}
+        release.attempt(lambda: check(str(path), state, expected))
     for p in absent:
-        state |= p.read(folder.find((p.file,), p.prefix.rstrip(".")))
-    return state
+        state |= release.read((p.file,), p.prefix.rstrip("."), p.read) or {}
+    return None if stored is None else state
 
 
-def _flame(folder: _Folder, state: State) -> flame.Flame:
-    tables = _cut(state, flame.PREFIX)
+def _flame(release: Release, state: State | None) -> flame.Flame | None:
+    """None after a problem.
+
+    Args:
+        state: of :func:`_complete_state`.
+    """
+    tables = {key: value.numpy() for key, value in _cut(state or {}, flame.PREFIX).items()}
     if tables:
-        return flame.from_checkpoint({key: value.numpy() for key, value in tables.items()})
-    model = folder.find(FLAME_NAMES, "FLAME")
-    return flame.from_files(model, folder.find(LANDMARK_NAMES, "FLAME's landmarks"))
+        fits = not differences(tables, part(flame.PREFIX))
+        return release.attempt(lambda: flame.from_checkpoint(tables)) if fits else None
+    read = (
+        (FLAME_NAMES, "FLAME", flame.read_model),
+        (LANDMARK_NAMES, "FLAME's landmarks", flame.read_landmarks),
+    )
+    model, landmarks = (
+        release.read(names, purpose, reader) if state is not None or release.has(*names) else None
+        for names, purpose, reader in read
+    )
+    return flame.from_files(model, landmarks) if model and landmarks else None
 
 
 def _converted(state: State, tables: flame.Flame, hierarchy: MeshHierarchy) -> Files:
@@ -287,10 +211,6 @@ def mesh_tensors(hierarchy: MeshHierarchy) -> State:
     for k, table in enumerate(hierarchy.spirals):
         tensors[f"spirals_{k}"] = torch.from_numpy(table)
     return tensors
-
-
-def _prefixed(prefix: str, state: Mapping[str, Tensor]) -> State:
-    return {prefix + key: value for key, value in state.items()}
 
 
 def _cut(state: Mapping[str, Tensor], prefix: str) -> State:

@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_matrix
+from scipy.sparse import csr_matrix
 
-from cvthead.errors import AssetError
 from cvthead.head.hierarchy import SPIRAL_LENGTH, MeshHierarchy
 from cvthead.head.spirals import spirals_of
 from cvthead.official.halfedges import HalfedgeMesh
-from cvthead.official.unpickle import HINT, load_pickle
+from cvthead.official.keys import refuse, table_problems
+from cvthead.official.unpickle import load_pickle, named_tables
 
 LEVELS = 2  # steps of the hierarchy that the network uses; the file has four
-COUNTS = (5023, 1256, 314)
+COUNTS = (5023, 1256, 314, 79, 20)
+FACES = (9976, 2464, 597, 139, 34)
 CORNERS = 3
+SHAPES = {
+    **{f"vertices[{k}]": (count, 3) for k, count in enumerate(COUNTS)},
+    **{f"face[{k}]": (count, CORNERS) for k, count in enumerate(FACES)},
+    **{f"down_transform[{k}]": (n, m) for k, (m, n) in enumerate(pairwise(COUNTS))},
+    **{f"up_transform[{k}]": counts for k, counts in enumerate(pairwise(COUNTS))},
+}
+ENTRIES = ("vertices", "face", "down_transform", "up_transform")
 
 Ints = NDArray[np.int32]
 Array = NDArray[np.float32]
@@ -27,53 +37,57 @@ def read_hierarchy(path: Path) -> MeshHierarchy:
     """Selections, interpolation weights and spirals of the three levels.
 
     Raises:
-        AssetError: unreadable, refused by the unpickler, or not these tables.
+        AssetError: unreadable, refused by the unpickler, or not these tables; names every one.
     """
-    tables = load_pickle(path)
-    try:
-        faces = [_faces(tables["face"][k], COUNTS[k]) for k in range(LEVELS)]
-        points = [_points(tables["vertices"][k], COUNTS[k]) for k in range(LEVELS)]
-        down = [_selection(tables["down_transform"][k], COUNTS[k : k + 2]) for k in range(LEVELS)]
-        up = [_weights(tables["up_transform"][k], COUNTS[k : k + 2]) for k in range(LEVELS)]
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
-        raise AssetError(f"{path} is not the released transform.pkl: {error}", hint=HINT) from error
-    tables_of_levels = tuple(_spirals(p, f) for p, f in zip(points, faces, strict=True))
-    return MeshHierarchy(tuple(down), tuple(up), tables_of_levels)
+    stored = named_tables(path, load_pickle(path))
+    # Its entry "adj" follows from the faces and is not read.
+    tables = {
+        f"{name}[{k}]": table
+        for name in ENTRIES
+        for k, table in enumerate(_levels(stored.get(name)))
+    }
+    problems = table_problems(tables, SHAPES, {f"face[{k}]": n for k, n in enumerate(COUNTS)})
+    for k in range(LEVELS):
+        down, up = f"down_transform[{k}]", f"up_transform[{k}]"
+        if down not in problems and not _selects(tables[down]):
+            problems[down] = f"{down} does not select one vertex a row"
+        if up not in problems and (_entries(tables[up]) != CORNERS).any():
+            problems[up] = f"{up} does not weigh {CORNERS} vertices a row"
+    refuse(str(path), problems.values())
+    levels = range(LEVELS)
+    return MeshHierarchy(
+        tuple(_selection(tables[f"down_transform[{k}]"]) for k in levels),
+        tuple(_weights(tables[f"up_transform[{k}]"]) for k in levels),
+        tuple(_spirals(tables[f"vertices[{k}]"], tables[f"face[{k}]"]) for k in levels),
+    )
 
 
-def _spirals(points: NDArray[np.float64], faces: Ints) -> Ints:
-    mesh = HalfedgeMesh(len(points), (tuple(face) for face in faces.tolist()))
+def _levels(entry: object) -> Sequence[Any]:
+    """The tables of an entry; none of what is no list."""
+    return entry if isinstance(entry, list | tuple) else ()
+
+
+def _entries(table: Any) -> NDArray[Any]:
+    """Stored in each row."""
+    return np.asarray(np.diff(csr_matrix(table).indptr))
+
+
+def _selects(table: Any) -> bool:
+    return bool((_entries(table) == 1).all() and (csr_matrix(table).data == 1).all())
+
+
+def _spirals(points: NDArray[Any], faces: NDArray[Any]) -> Ints:
+    mesh = HalfedgeMesh(len(points), (tuple(face) for face in faces.astype(np.int64).tolist()))
     rings = [mesh.ring(vertex) for vertex in range(len(points))]
-    return spirals_of(rings, points, SPIRAL_LENGTH).astype(np.int32)
+    return spirals_of(rings, points.astype(np.float64), SPIRAL_LENGTH).astype(np.int32)
 
 
-def _faces(value: Any, count: int) -> Ints:
-    faces = np.asarray(value).astype(np.int64)
-    if faces.ndim != 2 or faces.shape[1] != CORNERS or faces.min() < 0 or faces.max() >= count:
-        raise ValueError(f"faces of {count} vertices")
-    return faces.astype(np.int32)
+def _selection(table: Any) -> Ints:
+    return np.asarray(csr_matrix(table).indices, dtype=np.int32)
 
 
-def _points(value: Any, count: int) -> NDArray[np.float64]:
-    points = np.asarray(value, np.float64)
-    if points.shape != (count, 3):
-        raise ValueError(f"vertices have shape {points.shape}, not {(count, 3)}")
-    return points
-
-
-def _selection(matrix: csc_matrix, counts: tuple[int, ...]) -> Ints:
-    fine, coarse = counts
-    rows = matrix.tocsr()
-    if rows.shape != (coarse, fine) or rows.nnz != coarse or (rows.data != 1).any():
-        raise ValueError("down_transform does not select one vertex a row")
-    return np.asarray(rows.indices, dtype=np.int32)
-
-
-def _weights(matrix: csc_matrix, counts: tuple[int, ...]) -> tuple[Ints, Array]:
-    fine, coarse = counts
-    rows = matrix.tocsr()
-    if rows.shape != (fine, coarse) or (np.diff(rows.indptr) != CORNERS).any():
-        raise ValueError(f"up_transform does not weigh {CORNERS} vertices a row")
-    shape = (fine, CORNERS)
+def _weights(table: Any) -> tuple[Ints, Array]:
+    rows = csr_matrix(table)
+    shape = (rows.shape[0], CORNERS)
     # Used as stored: some are negative, and the rows do not sum to 1.
     return rows.indices.reshape(shape).astype(np.int32), rows.data.reshape(shape).astype(np.float32)

@@ -49,13 +49,28 @@ def load_state(path: Path, entry: str | None = None) -> dict[str, Tensor]:
         AssetError: as :func:`load`, or there is no state dict.
     """
     stored = load(path)
-    if entry is not None:
-        stored = stored.get(entry) if isinstance(stored, Mapping) else None
-    if not isinstance(stored, Mapping) or not all(
-        isinstance(key, str) and isinstance(value, Tensor) for key, value in stored.items()
-    ):
-        place = path if entry is None else f"entry {entry!r} of {path}"
+    if entry is None:
+        return named_tensors(str(path), stored)
+    return named_tensors(
+        f"entry {entry!r} of {path}", stored.get(entry) if isinstance(stored, Mapping) else None
+    )
+
+
+def named_tensors(place: str, stored: object) -> dict[str, Tensor]:
+    """A state dict, checked.
+
+    Raises:
+        AssetError: it is none; names what in it is no tensor.
+    """
+    if not isinstance(stored, Mapping):
         raise AssetError(f"{place} holds no named tensors", hint=HINT)
+    others = [
+        str(key)
+        for key, value in stored.items()
+        if not (isinstance(key, str) and isinstance(value, Tensor))
+    ]
+    if others:
+        raise AssetError(f"{place} holds no named tensors under {', '.join(others)}", hint=HINT)
     return dict(stored)
 
 
@@ -72,9 +87,10 @@ def load_tensor(path: Path) -> Tensor:
 
 
 def _reason(error: Exception) -> str:
-    """The first sentence; PyTorch adds advice to load without any check."""
+    """What is wrong, without PyTorch's advice to load without any check."""
     text = str(error)
     for mark in ("GLOBAL ", "Unsupported global: GLOBAL "):
         if mark in text:
             return f"it names {text.split(mark, 1)[1].split()[0]}, which is not a tensor type"
-    return text.splitlines()[0] if text else type(error).__name__
+    _, _, text = text.rpartition("WeightsUnpickler error:")
+    return text.strip().splitlines()[0] if text.strip() else type(error).__name__

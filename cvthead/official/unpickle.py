@@ -207,6 +207,17 @@ def load_pickle(path: Path, *, ignored: frozenset[str] = frozenset()) -> Any:
         raise AssetError(f"{path} is refused: {error}", hint=HINT) from error
 
 
+def named_tables(path: Path, stored: object) -> dict[str, Any]:
+    """The contents of a file that should hold tables by name.
+
+    Raises:
+        AssetError: it holds something else.
+    """
+    if not isinstance(stored, dict) or not all(isinstance(key, str) for key in stored):
+        raise AssetError(f"{path} holds no named tables", hint=HINT)
+    return stored
+
+
 def load_npy(path: Path, *, ignored: frozenset[str] = frozenset()) -> Any:
     """The one object of an ``.npy`` file that holds an object array; as :func:`load_pickle`.
 
