@@ -14,7 +14,7 @@ from cvthead.cli.portrait import add_preset_option
 from cvthead.data.layout import SPLITS
 from cvthead.deformation import DeformationModel
 from cvthead.errors import AssetError, InputError
-from cvthead.pipeline import Pipeline
+from cvthead.official.manifest import Manifest
 from cvthead.preset import Preset, load_preset
 from cvthead.runtime.model_folder import ModelFolder
 
@@ -76,7 +76,8 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         action="append",
         default=[],
         metavar="NAME=FOLDER",
-        help="a trained model of the open preset instead of the packaged one; repeat to compare",
+        help="a trained model of the preset, or another import of the official one, instead of "
+        "the one that the preset loads; repeat to compare",
     )
     parser.add_argument(
         "--without-deformation",
@@ -116,7 +117,7 @@ def run(args: argparse.Namespace) -> None:
 
     networks = UserNetworks.load(**{name: getattr(args, f"{name}_network") for name in NETWORKS})
     pipelines = load_models(args.preset, args.model)
-    haired = has_deformation(args.model)
+    haired = has_deformation(args.preset, args.model)
     methods = {
         name: trained(pipeline, deform=haired.get(name, True))
         for name, pipeline in pipelines.items()
@@ -143,38 +144,53 @@ def run(args: argparse.Namespace) -> None:
     plan = Plan(
         args.data, args.split, args.output, args.every, args.crossings, args.runs, args.people
     )
-    print(evaluate(plan, bench, pipelines, networks).markdown())
+    bald = {name for name, deform in haired.items() if not deform}
+    print(evaluate(plan, bench, pipelines, bald, networks).markdown())
     print(args.output / "index.html")
 
 
 def load_models(preset: str, models: Sequence[str]) -> dict[str, Preset[Any]]:
     """By the name of the method.
 
+    Args:
+        preset: of all of them.
+        models: ``NAME=FOLDER``; empty for the model that the preset loads.
+
     Raises:
-        InputError: a model without a name, a name twice, or models of another preset than open.
-        AssetError: as Pipeline.load and load_preset.
+        InputError: as named_folders.
+        AssetError: as load_preset.
     """
     if not models:
         return {"CVTHead" if preset == "open" else f"CVTHead, {preset}": load_preset(preset)}
-    if preset != "open":
-        raise InputError(f"--model goes with the preset open, not {preset}", hint="leave one out")
-    found: dict[str, Preset[Any]] = {}
+    folders = named_folders(models)
+    return {name: load_preset(preset, model=folder) for name, folder in folders.items()}
+
+
+def has_deformation(preset: str, models: Sequence[str]) -> dict[str, bool]:
+    """Whether the models of :func:`load_models` were trained with hair and shoulders."""
+    folders = named_folders(models)
+    if preset == "official":
+        return {name: Manifest.load(folder).deformation for name, folder in folders.items()}
+    return {
+        name: ModelFolder.load(folder).training.get("deformation") != "false"
+        for name, folder in folders.items()
+    }
+
+
+def named_folders(models: Sequence[str]) -> dict[str, Path]:
+    """The folders of ``NAME=FOLDER`` by name.
+
+    Raises:
+        InputError: one without a name, or a name twice.
+    """
+    found: dict[str, Path] = {}
     for text in models:
         name, equals, folder = text.partition("=")
         if not (name and equals and folder) or name in found:
             raise InputError(
                 f"--model {text} has no name of its own", hint="use NAME=FOLDER, each name once"
             )
-        found[name] = Pipeline.load(model=Path(folder))
-    return found
-
-
-def has_deformation(models: Sequence[str]) -> dict[str, bool]:
-    """Whether the models of :func:`load_models` were trained with hair and shoulders."""
-    found = {}
-    for text in models:
-        name, _, folder = text.partition("=")
-        found[name] = ModelFolder.load(Path(folder)).training.get("deformation") != "false"
+        found[name] = Path(folder)
     return found
 
 

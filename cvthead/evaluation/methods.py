@@ -19,6 +19,8 @@ from cvthead.evaluation.baselines import ColouredMesh
 from cvthead.evaluation.metrics import Picture, on_white
 from cvthead.evaluation.shots import Image, Shot, rotation
 from cvthead.head.model import HeadModel
+from cvthead.official.painted import HARD_MASK, Painted
+from cvthead.official.pipeline import OfficialPipeline
 from cvthead.preset import Preset
 from cvthead.tracking.tracker import FaceTurnedWarning, TrackedFace
 
@@ -88,7 +90,8 @@ Method = Callable[[Shot], Person]
 
 
 def trained(pipeline: Preset[Any], *, deform: bool = True) -> Method:
-    """A preset's networks; without ``deform`` hair and shoulders are left out."""
+    """A preset's networks; without ``deform`` hair and shoulders are left out. Results of the
+    official preset are cut out by the hard mask, as the released evaluation does."""
 
     def read(driver: Shot) -> TrackedFace:
         if pipeline.preset == "open":
@@ -101,6 +104,9 @@ def trained(pipeline: Preset[Any], *, deform: bool = True) -> Method:
             avatar = pipeline.encode(source.image, deform=deform)
 
         def draw(coefficients: Coefficients, camera: Camera) -> Drawn:
+            if isinstance(pipeline, OfficialPipeline):
+                points = pipeline.pose(avatar, coefficients, camera)
+                return hard_masked(pipeline.paint(avatar, points))
             frame = pipeline.render_coefficients(avatar, coefficients, camera)
             return Drawn(frame.rgb, frame.alpha.astype(np.float32) / np.float32(255))
 
@@ -109,6 +115,11 @@ def trained(pipeline: Preset[Any], *, deform: bool = True) -> Method:
         )
 
     return prepare
+
+
+def hard_masked(painted: Painted) -> Drawn:
+    """What the official U-Net painted, its matte 0 or 1."""
+    return Drawn(painted.frame().rgb, (painted.mask() > HARD_MASK).astype(np.float32))
 
 
 def baselines(deformer: DeformationModel) -> dict[str, Method]:

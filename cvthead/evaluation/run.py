@@ -79,12 +79,17 @@ class Plan:
 
 
 def evaluate(
-    plan: Plan, bench: Bench, pipelines: Mapping[str, Preset[Any]], networks: UserNetworks
+    plan: Plan,
+    bench: Bench,
+    pipelines: Mapping[str, Preset[Any]],
+    bald: Collection[str],
+    networks: UserNetworks,
 ) -> Report:
     """Measure, and write ``index.html``, ``report.md`` and ``report.json``.
 
     Args:
         pipelines: whose speed is measured, by method.
+        bald: those of them that are run without hair and shoulders.
 
     Raises:
         InputError: as find_videos, no clip in which a face can be tracked, or a damaged table of
@@ -97,7 +102,9 @@ def evaluate(
     grids = clip_grids(clips, plan.people)
     speeds: dict[str, NDArray[np.float64]] = {}
     if "speed" in bench.parts:
-        speeds = timed(seconds, "speed", lambda: measure_speed(clips[0], pipelines, plan.runs))
+        speeds = timed(
+            seconds, "speed", lambda: measure_speed(clips[0], pipelines, bald, plan.runs)
+        )
         sections[SPEED] = [speed_table(speeds, plan.runs)]
     if "cross" in bench.parts:
         tables, pictures = timed(
@@ -172,6 +179,7 @@ def clip_sections(bench: Bench, clips: Sequence[Clip]) -> dict[str, list[Table]]
     sections: dict[str, list[Table]] = {}
     own = [one for clip in clips for one in clip.reenacted]
     if own:
+        released = clips[0].persons[bench.trained[0]].preset == "official"
         sections[SELF] = [
             score_table("self-reenactment", "Both pictures on white by the target's mask:", own),
             score_table(
@@ -181,7 +189,7 @@ def clip_sections(bench: Bench, clips: Sequence[Clip]) -> dict[str, list[Table]]
                 own=True,
             ),
             part_table("unseen", "Over the pixels alone that the source did not show.", own),
-            paper_table("The paper's columns; LPIPS is absent without a network for it.", own),
+            paper_table(own, released=released),
             *(motion_table(name, [clip.motion[name] for clip in clips]) for name in bench.trained),
         ]
     far = [one for clip in clips for one in clip.far]
@@ -218,11 +226,11 @@ def clip_grids(clips: Sequence[Clip], people: int) -> dict[str, list[Grid]]:
 
 
 def measure_speed(
-    clip: Clip, pipelines: Mapping[str, Preset[Any]], runs: int
+    clip: Clip, pipelines: Mapping[str, Preset[Any]], bald: Collection[str], runs: int
 ) -> dict[str, NDArray[np.float64]]:
     """Of each trained method, with a source and a driver of one clip."""
     return {
-        name: frames_per_second(pipeline, clip.source, clip.lent[-1], runs)
+        name: frames_per_second(pipeline, clip.source, clip.lent[-1], runs, deform=name not in bald)
         for name, pipeline in pipelines.items()
     }
 

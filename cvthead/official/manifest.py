@@ -101,6 +101,7 @@ class Manifest:
         sha256: of each of FILES, and of the 8-bit ones that are there.
         psnr: 8-bit file -> dB of the pictures made with it, and with those before it that are
             served, to the float ones; also where that was too little.
+        deformation: False if the network was retrained without hair and shoulders.
     """
 
     folder: Path
@@ -108,6 +109,7 @@ class Manifest:
     sources: tuple[SourceFile, ...]
     sha256: Mapping[str, str]
     psnr: Mapping[str, float]
+    deformation: bool
 
     @classmethod
     def load(cls, folder: Path) -> Manifest:
@@ -137,12 +139,14 @@ class Manifest:
                 if name in record["sha256"]
             }
             psnr = {str(name): float(value) for name, value in record["psnr"].items()}
+            # Networks of earlier releases were all trained with it.
+            deformation = bool(record.get("deformation", True))
             fingerprint = str(record["fingerprint"])
             if not re.fullmatch("[0-9a-f]{16}", fingerprint):
                 raise ValueError("no fingerprint")
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise AssetError(f"{path} is not an imported model: {error!r}", hint=HINT) from error
-        return cls(folder, fingerprint, sources, sha256, psnr)
+        return cls(folder, fingerprint, sources, sha256, psnr, deformation)
 
     def checked(self, name: str) -> Path:
         """Path of a file of the import, after comparing its hash.
@@ -161,9 +165,17 @@ class Manifest:
 
 
 def write_manifest(
-    folder: Path, sources: tuple[SourceFile, ...], psnr: Mapping[str, float] | None = None
+    folder: Path,
+    sources: tuple[SourceFile, ...],
+    psnr: Mapping[str, float] | None = None,
+    *,
+    deformation: bool = True,
 ) -> None:
-    """Write ``model.json`` for the FILES and the 8-bit ones in ``folder``."""
+    """Write ``model.json`` for the FILES and the 8-bit ones in ``folder``.
+
+    Args:
+        folder, sources, psnr, deformation: as Manifest's.
+    """
     names = [*FILES, *(name for name in EIGHT_BIT.values() if (folder / name).is_file())]
     sha256 = {name: file_sha256(folder / name) for name in names}
     # Of the weights alone: an avatar stays what it is when the networks are exported anew.
@@ -175,6 +187,7 @@ def write_manifest(
         "sources": [asdict(source) for source in sources],
         "licences": [asdict(licence) for licence in LICENCES],
         "psnr": dict(psnr or {}),
+        "deformation": deformation,
         "sha256": sha256,
     }
     write_file(folder / RECORD, (json.dumps(record, indent=2) + "\n").encode())

@@ -36,6 +36,10 @@ class Painted:
         # Rounds halves to even and stays within 0..255.
         return Frame.of_rgba(np.asarray(cv2.convertScaleAbs(codes), np.uint8))
 
+    def mask(self) -> Array:
+        """(256, 256) the head's share of each pixel, 0 to 1."""
+        return np.asarray(0.5 * (np.tanh(self.raw[..., 3] * SLOPES[3]) + 1))
+
     def over_white(self, threshold: float | None = None) -> Image:
         """The painted head over white, as the released code writes it.
 
