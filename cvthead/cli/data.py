@@ -6,8 +6,10 @@ import argparse
 from importlib.util import find_spec
 from pathlib import Path
 
+from cvthead.cli.portrait import add_preset_option
 from cvthead.data.layout import TEST, VAL
 from cvthead.errors import InputError
+from cvthead.official.manifest import Manifest, default_folder
 from cvthead.runtime.threads import cores
 
 
@@ -49,6 +51,10 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     prepare.add_argument(
         "--processes", type=int, default=cores(), metavar="N", help="default: one per core"
     )
+    add_preset_option(prepare)
+    prepare.add_argument(
+        "--model", type=Path, metavar="FOLDER", help="of the preset official: another import"
+    )
     prepare.set_defaults(run=run)
 
 
@@ -65,7 +71,13 @@ def run(args: argparse.Namespace) -> None:
     # Only this command needs what is imported here.
     from cvthead.data.prepare import Settings, prepare
 
-    settings = Settings(args.val, args.test, args.frames, args.crop, args.shard_size)
-    report = prepare(args.videos, args.out, settings, processes=args.processes)
+    model, fingerprint = None, None
+    if args.preset == "official":
+        model = args.model or default_folder()
+        fingerprint = Manifest.load(model).fingerprint
+    elif args.model:
+        raise InputError("--model goes with --preset official", hint="leave it out, or add that")
+    settings = Settings(args.val, args.test, args.frames, args.crop, args.shard_size, fingerprint)
+    report = prepare(args.videos, args.out, settings, processes=args.processes, model=model)
     print(report.table())
     print(args.out)

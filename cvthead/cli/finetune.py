@@ -6,8 +6,10 @@ import argparse
 import sys
 from pathlib import Path
 
+from cvthead.cli.portrait import add_preset_option
 from cvthead.cli.train import add_set_option, configuration, require
 from cvthead.errors import InputError
+from cvthead.official.manifest import Manifest
 from cvthead.runtime.threads import cores
 
 LIBRARIES = ("torch", "einops", "lightning_fabric", "tensorboard", "webdataset", "onnxscript")
@@ -25,6 +27,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "videos", type=Path, metavar="VIDEOS", help="folder; one sub-folder per person"
     )
     parser.add_argument("out", type=Path, metavar="OUT", help="folder of records, run and model")
+    add_preset_option(parser)
     parser.add_argument(
         "--config",
         default="finetune",
@@ -48,18 +51,30 @@ def run(args: argparse.Namespace) -> None:
         raise InputError(f"--processes is {args.processes}", hint="use 1 or more")
     # PyTorch takes seconds to load and is not installed everywhere.
     from cvthead.data.prepare import Settings, prepare
+    from cvthead.official.retrained import export_retrained
     from cvthead.training.export import export
     from cvthead.training.train import train
 
     records, model = args.out / "data" / "train", args.out / "model"
-    config = configuration(args, {"data": records, "run": args.out / "run"})
-    if config.preset != "open":
+    given = {"data": records, "run": args.out / "run"}
+    if args.preset == "official":
+        given |= {"preset": "official", "init": "imported"}
+    config = configuration(args, given)
+    if config.preset == "paper":
         raise InputError(
             f"the runtime does not know the preset {config.preset}",
-            hint="use a configuration of the open preset",
+            hint="use a configuration of another preset",
         )
+    imported, fingerprint = None, None
+    if config.preset == "official":
+        imported = config.imported
+        fingerprint = Manifest.load(imported).fingerprint
     report = prepare(
-        args.videos, args.out / "data", Settings(val=0, test=0), processes=args.processes
+        args.videos,
+        args.out / "data",
+        Settings(val=0, test=0, official=fingerprint),
+        processes=args.processes,
+        model=imported,
     )
     print(report.table())
     if not report.kept["train"]["records"]:
@@ -70,7 +85,10 @@ def run(args: argparse.Namespace) -> None:
     say(f"training, the losses are in {config.run / 'log.jsonl'} ...")
     checkpoint = train(config)
     say("exporting ...")
-    export(checkpoint, model, records, {})
+    if imported is None:
+        export(checkpoint, model, records, {})
+    else:
+        export_retrained(checkpoint, model, imported, replace=True)
     print(model)
 
 

@@ -37,7 +37,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument(
         "--init",
         metavar="WEIGHTS",
-        help="start from a checkpoint.pt, a weights.safetensors, or `shipped`",
+        help="start from a checkpoint.pt, a weights.safetensors, `shipped`, or `imported`",
     )
     add_set_option(parser)
     parser.add_argument(

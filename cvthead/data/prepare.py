@@ -32,12 +32,14 @@ from typing import Any
 from tqdm import tqdm
 
 from cvthead.data.layout import SPLITS, TEST, VAL, Item, Split, find_items
+from cvthead.data.official import make_official_record
 from cvthead.data.report import Report
 from cvthead.data.shards import write_shard
 from cvthead.data.tracking import CropStyle, Outcome, make_record
 from cvthead.deformation import DeformationModel
 from cvthead.errors import InputError
 from cvthead.files import write_errors, write_file
+from cvthead.official.pipeline import OfficialPipeline
 from cvthead.points import PointLayout
 from cvthead.runtime.threads import one_thread_per_call
 from cvthead.tracking.tracker import FaceTurnedWarning, Tracker
@@ -53,6 +55,8 @@ class Settings:
         frames: sampled from each video.
         crop: see cvthead.data.tracking.make_record.
         shard_size: records per shard.
+        official: fingerprint of the import whose networks make records of the official preset;
+            None makes those of the open one.
     """
 
     val: float = VAL
@@ -60,15 +64,19 @@ class Settings:
     frames: int = 30
     crop: CropStyle = "head"
     shard_size: int = 256
+    official: str | None = None
 
 
-def prepare(videos: Path, out: Path, settings: Settings, *, processes: int) -> Report:
+def prepare(
+    videos: Path, out: Path, settings: Settings, *, processes: int, model: Path | None = None
+) -> Report:
     """Make or complete a folder of records; shows a progress bar on standard error.
 
     Args:
         videos: see cvthead.data.layout.
         out: new, or one of an earlier call with the same settings.
         processes: workers, one core each.
+        model: folder of the import that ``settings`` name.
 
     Raises:
         InputError: nothing to read, an output folder of other settings, no space, or a worker
@@ -81,7 +89,7 @@ def prepare(videos: Path, out: Path, settings: Settings, *, processes: int) -> R
     done = resume(out, settings)
     left = [item for item in items if item.key not in done]
     pending = {split: waiting(out, split, items, done) for split in SPLITS}
-    work = partial(_work, videos, out / "pending", settings)
+    work = partial(_work, videos, out / "pending", settings, model)
     with (
         (out / "journal.jsonl").open("a") as journal,
         workers(processes) as pool,
@@ -139,7 +147,8 @@ def resume(out: Path, settings: Settings) -> dict[str, Outcome]:
     text = journal.read_text()
     # A kill can cut the last line short; its file is done again.
     lines = [json.loads(line) for line in text[: text.rfind("\n") + 1].splitlines()]
-    if not lines or lines[0] != head:
+    # A setting that is newer than the journal had its default's effect.
+    if not lines or asdict(Settings()) | lines[0].get("settings", {}) != head["settings"]:
         raise InputError(
             f"{out} was made with other settings",
             hint="choose a new folder, or the settings in the first line of its journal.jsonl",
@@ -195,7 +204,7 @@ def facts(item: Item, outcome: Outcome, settings: Settings) -> dict[str, Any]:
         "split": item.split,
         "frames": outcome.frames,
         "crop": settings.crop,
-    }
+    } | ({"official": settings.official} if settings.official else {})
 
 
 def _start_worker() -> None:
@@ -219,12 +228,20 @@ def _models() -> tuple[Tracker, DeformationModel, PointLayout]:
     return tracker, DeformationModel.from_head(tracker.head), PointLayout.of(tracker.head)
 
 
-def _work(videos: Path, pending: Path, settings: Settings, item: Item) -> Outcome:
-    tracker, deformer, layout = _models()
-    return make_record(
-        tracker,
-        deformer,
-        layout,
+@cache
+def _official(model: Path) -> OfficialPipeline:
+    return OfficialPipeline.load(model, threads=1)
+
+
+def _work(
+    videos: Path, pending: Path, settings: Settings, model: Path | None, item: Item
+) -> Outcome:
+    make = (
+        partial(make_record, *_models())
+        if model is None
+        else partial(make_official_record, _official(model))
+    )
+    return make(
         videos / item.file,
         pending / f"{item.key}.npz",
         is_video=item.is_video,

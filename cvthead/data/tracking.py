@@ -109,6 +109,22 @@ def clip_crop(tracker: Tracker, faces: Sequence[TrackedFace]) -> Crop:
     return Crop(float((left + right - size) / 2), float((top + bottom - size) / 2), float(size))
 
 
+def read_tracked(
+    tracker: Tracker, path: Path, *, is_video: bool, frames: int
+) -> tuple[list[tuple[Image, TrackedFace]], Counter[str]] | Outcome:
+    """As :func:`track_frames`, of a file; or why it is of no use."""
+    try:
+        images = sampled_frames(path, frames) if is_video else [read_image(path)]
+    except CVTHeadError:
+        return Outcome(dropped=UNREADABLE)
+    if is_video and len(images) < MIN_FRAMES:
+        return Outcome(dropped=TOO_SHORT)
+    tracked, dropped = track_frames(tracker, images)
+    if not tracked:
+        return Outcome(dropped=dropped.most_common(1)[0][0], frames_dropped=dict(dropped))
+    return tracked, dropped
+
+
 def make_record(
     tracker: Tracker,
     deformer: DeformationModel,
@@ -131,15 +147,10 @@ def make_record(
             square of 0.36 m fixed to the face of each frame, so that training and use agree.
             "clip" is FOMM's and the paper's: one square per clip, within which the head moves.
     """
-    try:
-        images = sampled_frames(path, frames) if is_video else [read_image(path)]
-    except CVTHeadError:
-        return Outcome(dropped=UNREADABLE)
-    if is_video and len(images) < MIN_FRAMES:
-        return Outcome(dropped=TOO_SHORT)
-    tracked, dropped = track_frames(tracker, images)
-    if not tracked:
-        return Outcome(dropped=dropped.most_common(1)[0][0], frames_dropped=dict(dropped))
+    found = read_tracked(tracker, path, is_video=is_video, frames=frames)
+    if isinstance(found, Outcome):
+        return found
+    tracked, dropped = found
     square = clip_crop(tracker, [face for _, face in tracked]) if crop == "clip" else None
     heads = []
     for head in _cut(tracker, tracked, square):

@@ -17,6 +17,7 @@ class PixelAlignedCVTHead(nn.Module):
 
     def __init__(self, config: ModelConfig = PAPER) -> None:
         super().__init__()
+        self.config = config
         self.extractor = UNet(4, config.unet_sizes, config.descriptor_size)
         self.unet = UNet(1 + config.descriptor_size, config.unet_sizes)
 

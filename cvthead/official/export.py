@@ -17,6 +17,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 from cvthead.camera import CROP_PIXELS
 from cvthead.model.hair import LinearDeformation
 from cvthead.model.paper import PaperCVTHead
+from cvthead.model.paper_pixel_aligned import PixelAlignedCVTHead
 from cvthead.model.rome_encoder import StandardisedConv2d
 from cvthead.model.unet import ConvNorm, UNet
 from cvthead.official.crop import DECA_PIXELS
@@ -49,9 +50,9 @@ class HairGraph(nn.Module):
 
 
 class DescribeGraph(nn.Module):
-    """PaperCVTHead.describe."""
+    """PaperCVTHead.describe, or that of the ablation."""
 
-    def __init__(self, network: PaperCVTHead) -> None:
+    def __init__(self, network: PaperCVTHead | PixelAlignedCVTHead) -> None:
         super().__init__()
         self.network = network
 
@@ -112,32 +113,47 @@ def export_networks(folder: Path) -> None:
     Raises:
         AssetError: a file differs from PyTorch.
     """
-    torch_networks = TorchNetworks.load(folder)
-    generator = torch.Generator().manual_seed(0)
+    networks = TorchNetworks.load(folder)
+    picture = _noise(1, 3, CROP_PIXELS, CROP_PIXELS)
+    _export(folder / PARSING_ONNX, networks.parsing, {"image": picture}, ["logits"])
+    outputs = ["coefficients", "offsets"]
+    _export(folder / HAIR_ONNX, HairGraph(networks.hair), {"image": picture}, outputs)
+    face = _noise(1, 3, DECA_PIXELS, DECA_PIXELS) / 2 + 0.5
+    _export(folder / DECA_ONNX, networks.deca, {"face": face}, ["codes"])
+    export_network(folder, networks)
 
-    def noise(*shape: int) -> Tensor:
-        return torch.rand(shape, generator=generator) * 2 - 1
 
-    network, hair = torch_networks.network, torch_networks.hair
-    picture = noise(1, 3, CROP_PIXELS, CROP_PIXELS)
-    _export(folder / PARSING_ONNX, torch_networks.parsing, {"image": picture}, ["logits"])
-    _export(folder / HAIR_ONNX, HairGraph(hair), {"image": picture}, ["coefficients", "offsets"])
-    face = noise(1, 3, DECA_PIXELS, DECA_PIXELS) / 2 + 0.5
-    _export(folder / DECA_ONNX, torch_networks.deca, {"face": face}, ["codes"])
+def export_network(folder: Path, networks: TorchNetworks) -> None:
+    """Of :func:`export_networks` the two that are CVTHead's own.
 
-    source = torch.cat([picture, (noise(1, 1, CROP_PIXELS, CROP_PIXELS) > 0).float()], dim=1)
-    inputs = {"source": source, "points": noise(1, len(hair.deform_mean), 3)}
+    Args:
+        folder: of the files.
+        networks: taken over.
+
+    Raises:
+        AssetError: as :func:`export_networks`.
+    """
+    network, vertices = networks.network, len(networks.hair.deform_mean)
+    picture = _noise(1, 3, CROP_PIXELS, CROP_PIXELS)
+    mask = (_noise(1, 1, CROP_PIXELS, CROP_PIXELS) > 0).float()
+    inputs = {"source": torch.cat([picture, mask], dim=1), "points": _noise(1, vertices, 3)}
     with torch.inference_mode():
         expected = DescribeGraph(network)(**inputs)
-    _prepare(network.encoder)
+    if isinstance(network, PaperCVTHead):
+        _prepare(network.encoder)
     _export(folder / DESCRIBE_ONNX, DescribeGraph(network), inputs, ["descriptors"], [expected])
 
     channels = 1 + network.config.descriptor_size
-    splat = noise(1, CROP_PIXELS, CROP_PIXELS, channels)
+    splat = _noise(1, CROP_PIXELS, CROP_PIXELS, channels)
     with torch.inference_mode():
         expected = network.unet(splat.permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
     inputs = {"splat": F.pad(splat, (0, -channels % CHANNEL_STEP))}
     _export(folder / UNET_ONNX, UNetGraph(network.unet), inputs, ["raw"], [expected])
+
+
+def _noise(*shape: int) -> Tensor:
+    """The same in every call, in -1..1."""
+    return torch.rand(shape, generator=torch.Generator().manual_seed(0)) * 2 - 1
 
 
 def _export(

@@ -29,6 +29,7 @@ from cvthead.official.crop import FaceSquare
 from cvthead.official.manifest import PRESET, default_folder
 from cvthead.official.networks import OfficialNetworks, Precision, foreground, picture_array
 from cvthead.official.painted import Painted
+from cvthead.official.projection import project
 from cvthead.official.splat import splat
 from cvthead.official.tracker import OfficialTracker, Picture
 from cvthead.runtime.sessions import CPU
@@ -145,7 +146,7 @@ class OfficialPipeline:
         estimate = self.tracker.estimate(picture.pixels, square)
         offsets = self.offsets(image) if deform else np.zeros_like(self.head.template)
         camera = square.camera(estimate.cam)
-        points = self._project(estimate.coefficients, camera, offsets, square)
+        points = project(self.head, estimate.coefficients, camera, offsets, square)
         return OfficialAvatar(
             self.describe(image, mask, points),
             offsets,
@@ -166,6 +167,11 @@ class OfficialPipeline:
         """(1, 3, 256, 256) RGB in [-1, 1] -> (5023, 3) hair and shoulders in metres."""
         _, offsets = self.networks.hair(image)
         return np.asarray(offsets[0])
+
+    def hair(self, image: Array) -> Array:
+        """(1, 3, 256, 256) RGB in [-1, 1] -> (60,) coefficients of :meth:`offsets`."""
+        coefficients, _ = self.networks.hair(image)
+        return np.asarray(coefficients[0])
 
     def describe(self, image: Array, mask: Array, points: Array) -> Array:
         """(5023, 32) vertex descriptors (paper section 3.3).
@@ -297,7 +303,8 @@ class OfficialPipeline:
                 f"this model has {self.fingerprint}",
                 hint="encode the portrait again",
             )
-        return self._project(coefficients, camera, avatar.offsets, square or avatar.square)
+        placed = square or avatar.square
+        return project(self.head, coefficients, camera, avatar.offsets, placed)
 
     def paint(self, avatar: OfficialAvatar, points: Array) -> Painted:
         """Splat and U-Net (paper section 3.4) of the points of :meth:`pose`."""
@@ -312,10 +319,3 @@ class OfficialPipeline:
     def background(self, avatar: OfficialAvatar) -> Image:
         """(256, 256, 3) uint8 RGB: the portrait's crop with the person painted away."""
         return avatar.background
-
-    def _project(
-        self, coefficients: Coefficients, camera: Camera, offsets: Array, square: FaceSquare
-    ) -> Array:
-        points = camera.project(self.head.vertices(coefficients) + offsets)
-        points[:, 2] *= np.float32(square.depth_ratio)
-        return points

@@ -5,9 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from safetensors.numpy import load_file as load_arrays
 from safetensors.torch import load_file
 from torch import Tensor, nn
@@ -18,14 +16,19 @@ from cvthead.model.bisenet import FaceParsing
 from cvthead.model.deca import DecaEncoder
 from cvthead.model.hair import LinearDeformation
 from cvthead.model.paper import PaperCVTHead
+from cvthead.model.paper_pixel_aligned import PixelAlignedCVTHead
 from cvthead.official.manifest import DECA, HAIR, HINT, MESH, NETWORK, PARSING
+from cvthead.official.tables import stored_hierarchy
 
 
 @dataclass(frozen=True, eq=False)
 class TorchNetworks:
-    """Every network, in single precision and evaluation mode."""
+    """Every network, in single precision and evaluation mode.
 
-    network: PaperCVTHead
+    ``network`` is the released one, or one that was retrained with pixel-aligned features.
+    """
+
+    network: PaperCVTHead | PixelAlignedCVTHead
     parsing: FaceParsing
     hair: LinearDeformation
     deca: DecaEncoder
@@ -38,12 +41,11 @@ class TorchNetworks:
             AssetError: a file does not fit.
         """
         try:
-            hierarchy = _hierarchy(load_arrays(folder / MESH))
-            network = PaperCVTHead(hierarchy)
+            hierarchy = stored_hierarchy(load_arrays(folder / MESH))
+            network = _network(folder / NETWORK, hierarchy)
             parsing = FaceParsing()
             hair = LinearDeformation(hierarchy.spirals[0].shape[0])
             deca = DecaEncoder()
-            _fill(network, folder / NETWORK)
             _fill(parsing, folder / PARSING)
             _fill(hair, folder / HAIR)
             _fill(deca, folder / DECA)
@@ -54,23 +56,16 @@ class TorchNetworks:
         return cls(network, parsing, hair, deca)
 
 
+def _network(path: Path, hierarchy: MeshHierarchy) -> PaperCVTHead | PixelAlignedCVTHead:
+    with safe_open(str(path), framework="np") as file:
+        aligned = any(name.startswith("extractor.") for name in file.keys())  # noqa: SIM118
+    network = PixelAlignedCVTHead() if aligned else PaperCVTHead(hierarchy)
+    _fill(network, path)
+    return network
+
+
 def _fill(module: nn.Module, path: Path) -> None:
     state: dict[str, Tensor] = load_file(path)
     # Takes the file's memory over instead of copying it.
     module.load_state_dict(state, assign=True)
     module.eval().requires_grad_(False)
-
-
-def _hierarchy(arrays: dict[str, NDArray[np.generic]]) -> MeshHierarchy:
-    levels = range(2)
-    return MeshHierarchy(
-        tuple(arrays[f"down_{k}"].astype(np.int32) for k in levels),
-        tuple(
-            (
-                arrays[f"up_indices_{k}"].astype(np.int32),
-                arrays[f"up_weights_{k}"].astype(np.float32),
-            )
-            for k in levels
-        ),
-        tuple(arrays[f"spirals_{k}"].astype(np.int32) for k in levels),
-    )

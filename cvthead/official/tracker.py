@@ -115,8 +115,9 @@ class OfficialTracker:
         found = self.finder.track(image, face=face, only_one=only_one, previous=previous)
         return self.cut(image, found)
 
-    def cut(self, image: Image, found: TrackedFace) -> Picture:
-        crop = head_crop(self.finder.head, found.coefficients, found.camera)
+    def cut(self, image: Image, found: TrackedFace, crop: Crop | None = None) -> Picture:
+        """The head's own square of a picture, or another one that holds it."""
+        crop = crop or head_crop(self.finder.head, found.coefficients, found.camera)
         pixels, _ = crop.cut(image)
         landmarks = landmarks68(found.landmarks)[:, :2] - (crop.left, crop.top)
         # The finder counts the first pixel's centre as 0.5, the released code as 0.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,11 +16,12 @@ from torch.optim.swa_utils import AveragedModel
 
 from cvthead import weights
 from cvthead.errors import InputError
+from cvthead.official.manifest import NETWORK
 from cvthead.runtime.model_folder import WEIGHTS, packaged
 from cvthead.training.config import TrainConfig
 from cvthead.training.discriminator import MultiScaleDiscriminator
 
-SHIPPED, OPEN_PRESET = "shipped", "open"
+SHIPPED, IMPORTED, OPEN_PRESET = "shipped", "imported", "open"
 NOT_A_CHECKPOINT = "give a run's checkpoint.pt"
 
 
@@ -110,17 +112,19 @@ def resume(path: Path, fabric: Fabric, config: TrainConfig, state: RunState) -> 
     state.step, state.running = contents["step"], contents["running"]
 
 
-def start_from(init: str, state: RunState) -> None:
-    """Load weights of another run, of an export, or the shipped ones.
+def start_from(config: TrainConfig, state: RunState) -> None:
+    """Load the weights that ``config.init`` names.
 
     Raises:
         InputError: not such a file, or weights of another network.
     """
-    path = packaged(OPEN_PRESET) / WEIGHTS if init == SHIPPED else Path(init)
+    assert config.init is not None
+    named = {SHIPPED: packaged(OPEN_PRESET) / WEIGHTS, IMPORTED: config.imported / NETWORK}
+    path = named.get(config.init, Path(config.init))
     if not path.is_file():
         raise InputError(
             f"there are no weights {path}",
-            hint="give a checkpoint.pt, a weights.safetensors, or `shipped`",
+            hint="give a checkpoint.pt, a weights.safetensors, `shipped`, or `imported`",
         )
     if path.suffix == ".safetensors":
         weights.load_into(state.model, path)
@@ -145,6 +149,16 @@ def read(path: Path) -> dict[str, Any]:
     if not isinstance(contents, dict) or "model" not in contents:
         raise InputError(f"{path} is not a checkpoint", hint=NOT_A_CHECKPOINT)
     return contents
+
+
+def averaged(contents: Mapping[str, Any]) -> dict[str, Tensor]:
+    """The averaged weights of a checkpoint, which are exported."""
+    prefix = "module."
+    return {
+        name.removeprefix(prefix): value
+        for name, value in contents["averaged"].items()
+        if name.startswith(prefix)
+    }
 
 
 def _load(model: nn.Module, state: dict[str, Tensor], path: Path) -> None:

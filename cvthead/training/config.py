@@ -14,10 +14,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from cvthead.errors import InputError
 from cvthead.model.config import Features
+from cvthead.official.manifest import default_folder
 
 ST_LPIPS = "st-lpips-alex"
 # What may change between two sittings of one run without changing its result.
-FREE = frozenset({"data", "run", "init", "workers", "log_every", "save_every"})
+FREE = frozenset({"data", "model", "run", "init", "workers", "log_every", "save_every"})
 
 
 class Section(BaseModel):
@@ -73,17 +74,20 @@ class TrainConfig(Section):
     """One run.
 
     Attributes:
-        preset: network: "open", or "paper" on the open head.
+        preset: network: "open"; "paper" on the open head; or "official", the same on FLAME.
+        model: folder of the import whose head and tables "official" takes; None is the default
+            one.
         features: "fused" is the preset's own network; the others are ablations, see
-            cvthead.model.config. The preset paper has "pixel-aligned" alone.
+            cvthead.model.config. Presets "paper" and "official" have "pixel-aligned" alone.
         deformation: False trains on bald heads.
-        augmentation: False leaves the pictures as they are, to learn few of them by heart.
+        augmentation: False leaves the pictures as they are, to learn few of them by heart;
+            "official" never changes them.
         data: folder of records, such as the ``train`` folder of ``cvthead data prepare``.
         labels: CSV table (file, group) of the stills in ``data``, of which every group is then seen
             alike.
         run: folder of checkpoint and logs.
-        init: checkpoint.pt of another run, a weights.safetensors, or "shipped"; None starts
-            from random weights.
+        init: checkpoint.pt of another run, a weights.safetensors, "shipped", or "imported": the
+            official weights of ``model``; None starts from random weights.
         size: rendered height and width in pixels, a multiple of 32.
         steps: length of the run.
         batch: sources per step over all processes.
@@ -97,7 +101,8 @@ class TrainConfig(Section):
         log_every, save_every: steps between log lines and between checkpoints.
     """
 
-    preset: Literal["open", "paper"] = "open"
+    preset: Literal["open", "paper", "official"] = "open"
+    model: Path | None = None
     features: Features = "fused"
     deformation: bool = True
     augmentation: bool = True
@@ -124,11 +129,18 @@ class TrainConfig(Section):
     def _consistent(self) -> Self:
         if self.losses.identity and self.networks.identity is None:
             raise ValueError("losses.identity needs a file in networks.identity")
-        if self.preset == "paper" and self.features == "transformer":
+        if self.model is not None and self.preset != "official":
+            raise ValueError("model is for the preset official")
+        if self.preset != "open" and self.features == "transformer":
             raise ValueError("the paper's network is the transformer; remove features")
         if self.stage == 2 and not self.losses.adversarial:
             raise ValueError("stage 2 needs a factor in losses.adversarial")
         return self
+
+    @property
+    def imported(self) -> Path:
+        """Folder of the import that the preset official takes."""
+        return self.model or default_folder()
 
     def fixed(self) -> dict[str, Any]:
         """What must stay the same when a run goes on, as plain values."""

@@ -31,7 +31,7 @@ from cvthead.source import (
     portrait_pixels,
 )
 from cvthead.training.details import ZOOMED, detail_weights, unseen_weights, zoom_corner
-from cvthead.training.records import Frame, stored_records
+from cvthead.training.records import Frame, open_records
 from cvthead.training.sampling import group_shares, turned_still
 from cvthead.visibility import inside_mask, on_person
 
@@ -86,12 +86,13 @@ class PairDataset(Dataset[dict[str, Tensor]]):
         whole: True draws the points that the portrait cuts off as well, as the paper does.
 
         Raises:
-            InputError: no records in the folder, or no table of labels.
+            InputError: no records in the folder, those of the preset official, or no table of
+                labels.
         """
         self.deform, self.augment, self.whole = deform, augment, whole
         self.head, self.layout = head, layout
         self.size, self.seed, self.samples = size, seed, samples
-        stored = stored_records(folder)
+        stored = open_records(folder)
         self.clips = [record for record in stored if record.frames > 1]
         self.stills = [record for record in stored if record.frames == 1]
         self.shares = group_shares(self.stills, labels)

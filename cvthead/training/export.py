@@ -37,7 +37,7 @@ from cvthead.runtime.mix import LOGIT_RANGE
 from cvthead.runtime.model_folder import DESCRIBE, PAINT, WEIGHTS, write_record
 from cvthead.runtime.place import Placed, place
 from cvthead.source import places, portrait_pixels
-from cvthead.training.checkpoint import read
+from cvthead.training.checkpoint import averaged, read
 from cvthead.training.dataset import PairDataset
 from cvthead.training.onnx_export import export_describe, export_paint
 from cvthead.training.quantise import feed, quantise
@@ -56,22 +56,17 @@ def averaged_model(state: Mapping[str, Any]) -> CVTHead:
     """The averaged weights of a checkpoint of the open preset.
 
     Raises:
-        InputError: it is of the preset paper, which has no runtime.
+        InputError: it is of another preset.
     """
     config = state.get("config", {})
     if config.get("preset", "open") != "open":
         raise InputError(
-            f"a run of the preset {config['preset']} cannot be exported",
-            hint="the runtime knows the open preset; choose one of its checkpoints",
+            f"a run of the preset {config['preset']} is not exported by this",
+            hint="paper has no runtime; official has `python -m cvthead.official.retrained`",
         )
     network = replace(OPEN, features=config.get("features", "fused"))
     model = CVTHead(network, MeshHierarchy.load(), PointLayout.of(HeadModel.load()))
-    averaged = {
-        name.removeprefix("module."): value
-        for name, value in state["averaged"].items()
-        if name.startswith("module.")
-    }
-    model.load_state_dict(averaged)
+    model.load_state_dict(averaged(state))
     if network.features == "transformer":
         forget_portrait(model)
     return model

@@ -47,10 +47,10 @@ class Objective(nn.Module):
             discriminator: in stage 2; gets no gradient.
         """
         stage = self.config.stage
-        if self.config.preset == "paper":
-            losses = paper_losses(rgb, logits, views, self.perceptual, stage)
-        else:
+        if self.config.preset == "open":
             losses = reconstruction_losses(rgb, logits, views, self.perceptual)
+        else:
+            losses = paper_losses(rgb, logits, views, self.perceptual, stage)
         shown, target = compared_views(rgb, logits, views, stage)
         if self.identity is not None:
             losses["identity"] = self.identity(shown, target).mean()

@@ -24,6 +24,8 @@ from cvthead.source import HeadCrop, Source
 
 JPEG_QUALITY = 95
 
+Arrays = dict[str, NDArray[np.generic]]
+
 
 @dataclass(frozen=True, eq=False)
 class Frame:
@@ -47,7 +49,7 @@ class Frame:
 class Record:
     """An open record; frames are decoded when asked for."""
 
-    arrays: dict[str, NDArray[np.generic]]
+    arrays: Arrays
 
     @property
     def frames(self) -> int:
@@ -60,18 +62,9 @@ class Record:
 
     def frame(self, number: int) -> Frame:
         a = self.arrays
-        image = cv2.imdecode(a[f"image_{number}"].astype(np.uint8), cv2.IMREAD_COLOR_RGB)
-        masks = cv2.imdecode(a[f"mask_{number}"].astype(np.uint8), cv2.IMREAD_COLOR_RGB)
-        assert image is not None
-        assert masks is not None
         coefficients = Coefficients(a["shape"], a["expression"][number], a["pose"][number])  # type: ignore[arg-type]
-        return Frame(
-            image.astype(np.uint8),
-            masks[..., 0].astype(np.float32) / np.float32(255),
-            masks[..., 1] > 127,
-            coefficients,
-            Camera(*a["camera"][number].tolist()),
-        )
+        camera = Camera(*a["camera"][number].tolist())
+        return Frame(*stored_pictures(a, number), coefficients, camera)
 
     def motion(self, one: int, other: int) -> float:
         """How much two frames differ: mean change of pose in radians plus a tenth of the
@@ -116,9 +109,12 @@ class StoredRecord:
             file.seek(self.offset)
             return file.read(self.size)
 
-    def open(self) -> Record:
+    def arrays(self) -> Arrays:
         with np.load(io.BytesIO(self.read()), allow_pickle=False) as archive:
-            return Record(dict(archive))
+            return dict(archive)
+
+    def open(self) -> Record:
+        return Record(self.arrays())
 
 
 def index_of(shard: Path) -> Path:
@@ -156,6 +152,21 @@ def stored_records(folder: Path) -> list[StoredRecord]:
     return sorted(stored, key=lambda record: record.name)
 
 
+def open_records(folder: Path) -> list[StoredRecord]:
+    """As :func:`stored_records`, of the open preset.
+
+    Raises:
+        InputError: as :func:`stored_records`, or they were made for the preset official.
+    """
+    stored = stored_records(folder)
+    if "sources" not in stored[0].arrays():
+        raise InputError(
+            f"the records in {folder} were made for the preset official",
+            hint="make others with `cvthead data prepare VIDEOS OUT`",
+        )
+    return stored
+
+
 def records_hash(folder: Path) -> str:
     """SHA-256 over names and contents of the records; the same for files and for shards."""
     digest = hashlib.sha256()
@@ -167,7 +178,7 @@ def records_hash(folder: Path) -> str:
 
 def write(path: Path, heads: list[HeadCrop], sources: dict[int, Source]) -> None:
     """Store the frames of one identity; ``sources`` by frame number."""
-    arrays: dict[str, NDArray[np.generic]] = {
+    arrays: Arrays = {
         "shape": heads[0].coefficients.shape,
         "expression": np.stack([h.coefficients.expression for h in heads]),
         "pose": np.stack([h.coefficients.pose for h in heads]),
@@ -175,18 +186,45 @@ def write(path: Path, heads: list[HeadCrop], sources: dict[int, Source]) -> None
         "sources": np.array(sorted(sources)),
     }
     for number, head in enumerate(heads):
-        arrays[f"image_{number}"] = _encoded(".jpg", head.image[..., ::-1])
-        mask = (head.mask * 255).astype(np.uint8)
-        valid = head.valid.astype(np.uint8) * 255
-        arrays[f"mask_{number}"] = _encoded(".png", np.stack([mask * 0, valid, mask], axis=-1))
+        arrays |= picture_arrays(number, head.image, head.mask, head.valid)
     for number, source in sources.items():
         arrays[f"offsets_{number}"] = source.deformation.offsets.astype(np.float16)
         arrays[f"shell_anchor_{number}"] = source.deformation.shell_anchor
         arrays[f"shell_offset_{number}"] = source.deformation.shell_offset.astype(np.float16)
         arrays[f"visible_{number}"] = np.packbits(source.visible)
+    write_arrays(path, arrays)
+
+
+def write_arrays(path: Path, arrays: Arrays) -> None:
+    """Store a record's arrays, all or none."""
     temporary = path.with_suffix(".tmp.npz")
     np.savez(temporary, **arrays)  # type: ignore[arg-type]
     temporary.rename(path)
+
+
+def picture_arrays(
+    number: int, image: NDArray[np.uint8], mask: NDArray[np.float32], valid: NDArray[np.bool_]
+) -> Arrays:
+    """A frame's pictures as a record stores them; arguments as in :class:`Frame`."""
+    person, inside = (mask * 255).astype(np.uint8), valid.astype(np.uint8) * 255
+    return {
+        f"image_{number}": _encoded(".jpg", image[..., ::-1]),
+        f"mask_{number}": _encoded(".png", np.stack([person * 0, inside, person], axis=-1)),
+    }
+
+
+def stored_pictures(
+    arrays: Arrays, number: int
+) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]:
+    """Image, mask and valid of a frame, see :class:`Frame`."""
+    image, masks = (
+        cv2.imdecode(arrays[f"{name}_{number}"].astype(np.uint8), cv2.IMREAD_COLOR_RGB)
+        for name in ("image", "mask")
+    )
+    assert image is not None
+    assert masks is not None
+    person = masks[..., 0].astype(np.float32) / np.float32(255)
+    return image.astype(np.uint8), person, masks[..., 1] > 127
 
 
 def _encoded(kind: str, image: NDArray[np.generic]) -> NDArray[np.uint8]:

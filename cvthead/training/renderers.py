@@ -1,4 +1,4 @@
-"""The networks as training runs them: a batch of PairDataset in, rendered views out."""
+"""The networks as training runs them: a batch of samples in, rendered views out."""
 
 from __future__ import annotations
 
@@ -8,13 +8,16 @@ from einops import rearrange, repeat
 from torch import Tensor, nn
 
 from cvthead.head.hierarchy import MeshHierarchy
-from cvthead.model.config import OPEN
+from cvthead.head.model import HeadModel
+from cvthead.model.config import OPEN, Features
 from cvthead.model.cvthead import CVTHead
 from cvthead.model.paper import PaperCVTHead
 from cvthead.model.paper_pixel_aligned import PixelAlignedCVTHead
+from cvthead.official.tables import OfficialTables
 from cvthead.points import PointLayout
 from cvthead.training.config import TrainConfig
-from cvthead.training.dataset import VIEWS
+from cvthead.training.dataset import VIEWS, PairDataset
+from cvthead.training.official_dataset import OfficialPairDataset
 
 Batch = dict[str, Tensor]
 
@@ -40,10 +43,10 @@ class OpenRenderer(nn.Module):
 
 
 class PaperRenderer(nn.Module):
-    """The paper's network on the open head: its mesh vertices alone are the points.
+    """The paper's network: the mesh vertices alone are its points.
 
-    Unlike the released code, whose encoder sees the portrait's background, this one sees the
-    person on black, which is what the records' samples hold.
+    On the open head, unlike in the released code, whose encoder sees the portrait's background,
+    it sees the person on black, which is what the open records' samples hold.
     """
 
     def __init__(self, model: PaperCVTHead | PixelAlignedCVTHead, vertices: int) -> None:
@@ -58,11 +61,45 @@ class PaperRenderer(nn.Module):
         return self.model.paint(driven, descriptors, batch["image"].shape[-1])
 
 
-def build_renderer(config: TrainConfig, layout: PointLayout) -> OpenRenderer | PaperRenderer:
-    """The network of a configuration, with random weights."""
-    hierarchy = MeshHierarchy.load()
+Renderer = OpenRenderer | PaperRenderer
+Samples = PairDataset | OfficialPairDataset
+
+
+def training_parts(config: TrainConfig) -> tuple[Samples, Renderer]:
+    """Samples of a configuration, and its network with random weights.
+
+    Raises:
+        InputError: no records, or those of another preset; no table of labels.
+        AssetError: preset official, and nothing was imported.
+    """
+    common = {
+        "size": config.size,
+        "seed": config.seed + config.size,
+        "samples": config.steps * config.batch,
+    }
+    if config.preset == "official":
+        tables = OfficialTables.load(config.imported)
+        samples = OfficialPairDataset(config.data, tables, deform=config.deformation, **common)
+        return samples, paper_renderer(config.features, tables.hierarchy)
+    head, hierarchy = HeadModel.load(), MeshHierarchy.load()
+    layout = PointLayout.of(head)
+    pairs = PairDataset(
+        config.data,
+        head,
+        layout,
+        deform=config.deformation,
+        labels=config.labels,
+        augment=config.augmentation,
+        whole=config.preset == "paper",
+        **common,
+    )
     if config.preset == "paper":
-        aligned = config.features == "pixel-aligned"
-        model = PixelAlignedCVTHead() if aligned else PaperCVTHead(hierarchy)
-        return PaperRenderer(model, layout.vertices)
-    return OpenRenderer(CVTHead(replace(OPEN, features=config.features), hierarchy, layout))
+        return pairs, paper_renderer(config.features, hierarchy)
+    return pairs, OpenRenderer(CVTHead(replace(OPEN, features=config.features), hierarchy, layout))
+
+
+def paper_renderer(features: Features, hierarchy: MeshHierarchy) -> PaperRenderer:
+    """The paper's network on a head, or its ablation with pixel-aligned features."""
+    aligned = features == "pixel-aligned"
+    model = PixelAlignedCVTHead() if aligned else PaperCVTHead(hierarchy)
+    return PaperRenderer(model, hierarchy.counts[0])

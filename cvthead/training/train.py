@@ -25,17 +25,14 @@ from torch.utils.data import DataLoader, Subset
 
 from cvthead.errors import InputError
 from cvthead.files import write_errors, write_file
-from cvthead.head.model import HeadModel
-from cvthead.points import PointLayout
 from cvthead.runtime.threads import cores
 from cvthead.training.checkpoint import RunState, resume, save, share_running, start_from
 from cvthead.training.config import TrainConfig
-from cvthead.training.dataset import PairDataset
 from cvthead.training.discriminator import MultiScaleDiscriminator, discriminator_loss
 from cvthead.training.log import RunLog, sample_grid, save_picture
 from cvthead.training.losses import compared_views
 from cvthead.training.objective import Objective
-from cvthead.training.renderers import Batch, build_renderer
+from cvthead.training.renderers import Batch, Samples, training_parts
 from cvthead.training.schedule import averaging, freeze_norms, learning_rate
 
 SMOOTHING = 0.98  # of the logged losses, per step
@@ -55,25 +52,12 @@ def train(config: TrainConfig, *, sitting: int | None = None) -> Path:
     Raises:
         InputError: no records, missing weights, a batch that the processes cannot share, or a
             run folder of other settings.
+        AssetError: preset official, and nothing was imported.
     """
     fabric = launched(config)
     torch.manual_seed(config.seed)
-    head = HeadModel.load()
-    layout = PointLayout.of(head)
-    dataset = PairDataset(
-        config.data,
-        head,
-        layout,
-        size=config.size,
-        seed=config.seed + config.size,
-        samples=config.steps * config.batch,
-        deform=config.deformation,
-        labels=config.labels,
-        augment=config.augmentation,
-        whole=config.preset == "paper",
-    )
+    dataset, renderer = training_parts(config)
     objective = Objective(config).to(fabric.device)
-    renderer = build_renderer(config, layout)
     renderer.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     discriminator = MultiScaleDiscriminator() if config.stage == 2 else None
     # Wrapped for the distributed forward pass; the state keeps the plain networks.
@@ -95,7 +79,7 @@ def train(config: TrainConfig, *, sitting: int | None = None) -> Path:
     if checkpoint.exists():
         resume(checkpoint, fabric, config, state)
     elif config.init is not None:
-        start_from(config.init, state)
+        start_from(config, state)
     fabric.barrier()  # nobody writes before everybody has read
     first = state.step
     last = config.steps if sitting is None else min(config.steps, first + sitting)
@@ -191,7 +175,7 @@ def new_optimiser(config: TrainConfig, network: nn.Module) -> Optimizer:
 
 
 def batches(
-    fabric: Fabric, config: TrainConfig, dataset: PairDataset, first: int, last: int
+    fabric: Fabric, config: TrainConfig, dataset: Samples, first: int, last: int
 ) -> Iterator[Batch]:
     """This process's share of the samples of steps ``first`` to ``last`` - 1."""
     share = config.batch // fabric.world_size
@@ -213,8 +197,9 @@ def batches(
 
 def per_view(batch: Batch) -> dict[str, Tensor]:
     """What the losses compare with, by view."""
-    views = {name: rearrange(batch[name], "b v ... -> (b v) ...") for name in PER_VIEW}
-    return views | {"window": batch["window"]}
+    views = {name: batch[name] for name in PER_VIEW if name in batch}
+    views = {name: rearrange(value, "b v ... -> (b v) ...") for name, value in views.items()}
+    return views | {name: batch[name] for name in ("window",) if name in batch}
 
 
 def descend(

@@ -1,0 +1,96 @@
+"""Training samples of the official preset: a frame of a video as source, others as drivers.
+
+As the paper trains (section 4.1): frames of one video, the source's shape on every driver, a
+random background behind the driven views. Nothing is augmented.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from cvthead.coefficients import Array
+from cvthead.official.networks import picture_array
+from cvthead.official.projection import project
+from cvthead.official.tables import OfficialTables
+from cvthead.training.dataset import VIEWS
+from cvthead.training.official_records import OfficialFrame, OfficialRecord, official_records
+
+
+class OfficialPairDataset(Dataset[dict[str, Tensor]]):
+    """Sample ``i`` depends on ``seed`` and ``i`` alone, so a run resumes exactly."""
+
+    def __init__(
+        self,
+        folder: Path,
+        tables: OfficialTables,
+        *,
+        size: int,
+        seed: int,
+        samples: int,
+        deform: bool = True,
+    ) -> None:
+        """Args:
+        folder: records, see cvthead.training.official_records.
+        tables: of the import that made them.
+        size: of the driven views, pixels.
+        samples: length.
+        deform: False leaves out hair and shoulders: the ablation without deformation.
+
+        Raises:
+            InputError: no records in the folder, or those of the open preset.
+        """
+        self.tables, self.size, self.seed, self.samples = tables, size, seed, samples
+        self.deform = deform
+        self.stored = official_records(folder)
+
+    def __len__(self) -> int:
+        return self.samples
+
+    def __getitem__(self, index: int) -> dict[str, Tensor]:
+        cv2.setNumThreads(1)
+        rng = np.random.default_rng((self.seed, index))
+        stored = self.stored[int(rng.integers(len(self.stored)))]
+        record = OfficialRecord(stored.arrays())
+        source, *drivers = (
+            record.frame(int(n)) for n in rng.integers(record.frames, size=1 + VIEWS)
+        )
+        background = rng.random((1, 3, 1, 1)).astype(np.float32)
+        stack = {
+            "source": np.concatenate([picture_array(source.image)[0], source.mask[None]]),
+            "points": self.points(source, source),
+            "background": np.repeat(background, VIEWS, axis=0),
+            "driven": np.stack([self.points(source, driver) for driver in drivers]),
+            "image": np.stack([self._image(driver) for driver in drivers]),
+            "mask": np.stack([self._resized(driver.mask)[None] for driver in drivers]),
+            "valid": np.stack([self._valid(driver)[None] for driver in drivers]),
+        }
+        return {name: torch.from_numpy(value) for name, value in stack.items()}
+
+    def points(self, source: OfficialFrame, driver: OfficialFrame) -> Array:
+        """(5023, 3) the source's head and hair, moved as the driver's and seen where it is."""
+        offsets = self.tables.offsets(source.hair)
+        if not self.deform:
+            offsets = np.zeros_like(offsets)
+        posed = replace(driver.coefficients, shape=source.coefficients.shape)
+        return project(self.tables.head, posed, driver.camera, offsets, driver.square)
+
+    def _image(self, frame: OfficialFrame) -> Array:
+        scaled = frame.image.astype(np.float32) / np.float32(255)
+        return np.ascontiguousarray(self._resized(scaled).transpose(2, 0, 1))
+
+    def _valid(self, frame: OfficialFrame) -> Array:
+        inside = self._resized(frame.valid.astype(np.float32)) > 0.99
+        return inside.astype(np.float32)
+
+    def _resized(self, image: Array) -> Array:
+        if image.shape[0] == self.size:
+            return image
+        size = (self.size, self.size)
+        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
