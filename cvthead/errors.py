@@ -26,7 +26,7 @@ The message says what is wrong; ``hint`` says what to do next; ``code`` is stabl
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 
 class CVTHeadError(Exception):
@@ -37,6 +37,10 @@ class CVTHeadError(Exception):
     def __init__(self, message: str, *, hint: str) -> None:
         super().__init__(message)
         self.hint = hint
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # An error of a worker process keeps its type and all it carries.
+        return _rebuilt, (type(self), self.args, vars(self))
 
 
 class InputError(CVTHeadError):
@@ -120,3 +124,12 @@ class StoreError(AvatarError):
 
 class AssetError(CVTHeadError):
     code = "asset_error"
+
+
+def _rebuilt(
+    kind: type[CVTHeadError], args: tuple[Any, ...], state: dict[str, Any]
+) -> CVTHeadError:
+    error = kind.__new__(kind)
+    error.args = args
+    vars(error).update(state)
+    return error

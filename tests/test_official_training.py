@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,22 +15,24 @@ import pytest
 import torch
 from made_loss_networks import made_vgg
 from made_records import make_records
+from pydantic import ValidationError
 from safetensors.torch import load_file
 
 from cvthead.camera import CROP_PIXELS
 from cvthead.cli.main import main
 from cvthead.errors import InputError
 from cvthead.images import read_image
-from cvthead.official import retrained
-from cvthead.official.manifest import NETWORK, Manifest
+from cvthead.official.manifest import HAIR_ONNX, NETWORK, Manifest
+from cvthead.official.networks import picture_array
 from cvthead.official.pipeline import OfficialPipeline
+from cvthead.official.retrained import RETRAINED
 from cvthead.official.tables import OfficialTables
 from cvthead.training.checkpoint import averaged, read
 from cvthead.training.config import TrainConfig, load_config
 from cvthead.training.dataset import VIEWS
 from cvthead.training.export import averaged_model
 from cvthead.training.official_dataset import OfficialPairDataset
-from cvthead.training.official_records import OfficialRecord, official_records
+from cvthead.training.official_records import OfficialFrame, OfficialRecord, official_records
 from cvthead.training.renderers import paper_renderer, training_parts
 from cvthead.training.train import train
 from cvthead.video_writer import video_writer
@@ -38,7 +41,7 @@ PORTRAIT = Path(__file__).parents[1] / "examples" / "astronaut.png"
 FRAMES = 6
 VERTICES = 5023
 STEPS, RATE = 2, 1e-4
-SMALL = (f"steps={STEPS}", "size=64", "batch=1", "workers=0", "log_every=1", "average=0.5")
+SMALL = (f"steps={STEPS}", "size=64", "batch=1", "workers=1", "log_every=1", "average=0.5")
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -103,14 +106,14 @@ def configured(data: Path, model: Path, vgg: Path, run: Path, **changes: Any) ->
 
 def samples(data: Path, model: Path, size: int, **options: Any) -> OfficialPairDataset:
     tables = OfficialTables.load(model)
-    return OfficialPairDataset(data / "train", tables, size=size, seed=1, samples=4, **options)
+    return OfficialPairDataset(data / "train", tables, size=size, seed=1, samples=8, **options)
 
 
 def test_a_record_holds_what_encoding_asks_the_networks(data: Path, model: Path) -> None:
     report = json.loads((data / "report.json").read_text())
     assert report["dropped"] == {"a still": 1}
     assert report["kept"]["train"] == {"records": 1, "frames": FRAMES, "identities": 1}
-    (stored,) = official_records(data / "train")
+    (stored,) = official_records(data / "train", Manifest.load(model).tables)
     assert stored.frames == FRAMES
     pipeline, tables = OfficialPipeline.load(model, threads=1), OfficialTables.load(model)
     record = OfficialRecord(stored.arrays())
@@ -130,8 +133,7 @@ def test_a_record_holds_what_encoding_asks_the_networks(data: Path, model: Path)
 
 def test_a_sample_projects_as_the_pipeline_does(data: Path, model: Path) -> None:
     dataset = samples(data, model, CROP_PIXELS)
-    record = OfficialRecord(dataset.stored[0].arrays())
-    source, driver = record.frame(0), record.frame(3)
+    source, driver = two_frames(dataset)
     pipeline = OfficialPipeline.load(model, precision="float32", threads=1)
     offsets = dataset.tables.offsets(source.hair)
     avatar = replace(made_official.avatar(), offsets=offsets, fingerprint=pipeline.fingerprint)
@@ -142,7 +144,30 @@ def test_a_sample_projects_as_the_pipeline_does(data: Path, model: Path) -> None
     assert np.abs(dataset.points(driver, driver) - expected).max() > 1e-3  # shape and hair
 
 
-def test_samples_are_the_papers(data: Path, model: Path) -> None:
+def test_points_lie_where_the_released_code_puts_them(data: Path, model: Path) -> None:
+    """Step by step as it does: into the crop that DECA saw, to pixels, back by the similarity."""
+    dataset = samples(data, model, CROP_PIXELS)
+    frame, _ = two_frames(dataset)
+    estimate = OfficialPipeline.load(model, threads=1).tracker.estimate(frame.image, frame.square)
+    camera = frame.square.camera(estimate.cam)
+    found = replace(frame, coefficients=estimate.coefficients, camera=camera)
+    tables = dataset.tables
+    vertices = tables.head.vertices(found.coefficients) + tables.offsets(found.hair)
+    scale, x, y = estimate.cam.tolist()
+    in_crop = scale * (vertices + np.array([x, y, 0])) * [1, -1, -1]
+    pixels = (0.5 * in_crop[:, :2] + 0.5) * 224
+    homogeneous = np.concatenate([pixels, np.ones((VERTICES, 1))], axis=1)
+    picture = homogeneous @ np.linalg.inv(frame.square.tform.astype(np.float64)).T
+    expected = np.concatenate([picture[:, :2] / 128 - 1, in_crop[:, 2:]], axis=1)
+    assert np.allclose(dataset.points(found, found), expected, atol=1e-4)
+
+
+def two_frames(dataset: OfficialPairDataset) -> tuple[OfficialFrame, OfficialFrame]:
+    record = OfficialRecord(dataset.stored[0].arrays())
+    return record.frame(0), record.frame(3)
+
+
+def test_samples_are_frames_of_one_video(data: Path, model: Path) -> None:
     dataset = samples(data, model, 64)
     first, again, other = dataset[1], dataset[1], dataset[2]
     assert all(torch.equal(first[name], again[name]) for name in first)
@@ -150,9 +175,14 @@ def test_samples_are_the_papers(data: Path, model: Path) -> None:
     assert first["source"].shape == (4, CROP_PIXELS, CROP_PIXELS)
     assert first["driven"].shape == (VIEWS, VERTICES, 3)
     assert first["image"].shape == (VIEWS, 3, 64, 64)
+    record = OfficialRecord(dataset.stored[0].arrays())
     # The encoder sees the picture over its own background.
-    outside = first["source"][:3, first["source"][3] == 0]
-    assert outside.numel() == 0 or outside.std() > 0
+    pictures = [picture_array(record.frame(number).image)[0] for number in range(FRAMES)]
+    assert any(np.array_equal(first["source"][:3], picture) for picture in pictures)
+    for number in range(len(dataset)):
+        sample = dataset[number]
+        assert not torch.equal(sample["driven"][0], sample["driven"][1])
+        assert all(not torch.equal(sample["points"], driven) for driven in sample["driven"])
     bald = samples(data, model, 64, deform=False)[1]
     assert not torch.equal(bald["points"], first["points"])
     assert torch.equal(bald["image"], first["image"])
@@ -181,7 +211,7 @@ def test_a_run_becomes_a_model_of_the_preset(model: Path, out: Path, run: Path) 
     before, after = Manifest.load(model), Manifest.load(folder)
     assert before.fingerprint != after.fingerprint
     assert after.sources[:-1] == before.sources
-    assert after.sources[-1].used_for == (retrained.RETRAINED,)
+    assert after.sources[-1].used_for == (RETRAINED,)
     network = paper_renderer("fused", OfficialTables.load(model).hierarchy).model.eval()
     network.load_state_dict(averaged(read(run)))
     pipeline = OfficialPipeline.load(folder, precision="float32", threads=1)
@@ -203,17 +233,47 @@ def test_presets_do_not_mix(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     make_records(tmp_path)
-    with pytest.raises(InputError, match="made for the open preset"):
-        official_records(tmp_path)
-    with pytest.raises(InputError, match="made for the preset official"):
-        training_parts(TrainConfig(data=data / "train", steps=1))
+    tables = Manifest.load(model).tables
+    with pytest.raises(InputError, match="records of the open preset"):
+        official_records(tmp_path, tables)
+    with pytest.raises(InputError, match=f"records of the import {tables}"):
+        official_records(data / "train", "0" * 16)
+    for path in (data / "train").iterdir():
+        shutil.copy(path, tmp_path)
+    with pytest.raises(InputError, match="records of the preset official"):
+        training_parts(TrainConfig(data=tmp_path, steps=1))
+    with pytest.raises(InputError, match="records of the open preset"):
+        official_records(tmp_path, tables)
     with pytest.raises(InputError, match="is not exported by this"):
         averaged_model(read(run))
     with pytest.raises(InputError, match="model is for the preset official"):
         configured(data, model, vgg, tmp_path, preset="paper")
-    command = ["data", "prepare", str(data), str(tmp_path / "out"), "--model", str(model)]
-    assert main(command) == 2
+    with pytest.raises(ValidationError, match="imported weights are of the preset official"):
+        TrainConfig(init="imported", steps=1)
+    with pytest.raises(InputError, match="has no ablation"):
+        configured(data, model, vgg, tmp_path, features="pixel-aligned", init="imported")
+    shipped = configured(data, model, vgg, tmp_path / "run", init="shipped")
+    with pytest.raises(InputError, match="holds another network"):
+        train(shipped)
+    folders = [str(data), str(tmp_path / "out")]
+    assert main(["data", "prepare", *folders, "--model", str(model)]) == 2
     assert "--model goes with --preset official" in capsys.readouterr().err
+    assert main(["finetune", *folders, "--set", "preset=official"]) == 2
+    assert "add --preset official" in capsys.readouterr().err
+
+
+def test_a_damaged_import_is_said_by_the_process_that_finds_it(
+    model: Path, out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    damaged = tmp_path / "model"
+    damaged.mkdir()
+    for path in model.iterdir():
+        (damaged / path.name).symlink_to(path)
+    (damaged / HAIR_ONNX).unlink()
+    command = ["data", "prepare", str(out.parent / "videos"), str(tmp_path / "out")]
+    command += ["--preset", "official", "--model", str(damaged), "--processes", "1"]
+    assert main(command) == 2
+    assert f"{HAIR_ONNX} is missing" in capsys.readouterr().err
 
 
 def test_the_ablation_becomes_a_model_too(
@@ -223,13 +283,21 @@ def test_the_ablation_becomes_a_model_too(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    changes = {"features": "pixel-aligned", "deformation": False}
-    checkpoint = train(configured(data, model, vgg, tmp_path / "run", **changes))
-    command = [str(checkpoint), str(tmp_path / "model"), "--model", str(model)]
-    retrained.main([*command, "--precision", "float32"])
-    assert capsys.readouterr().out.strip() == str(tmp_path / "model")
-    with pytest.raises(InputError, match="already there"):
-        retrained.main(command)
-    pipeline = OfficialPipeline.load(tmp_path / "model", threads=1)
-    avatar = pipeline.encode(read_image(PORTRAIT), deform=False)
+    """Trained in the second stage, in two sittings."""
+    losses = {"identity": 0.0, "adversarial": 0.1, "feature_matching": 1.0}
+    changes = {"features": "pixel-aligned", "deformation": False, "stage": 2, "steps": 2}
+    config = configured(data, model, vgg, tmp_path / "run", losses=losses, **changes)
+    train(config, sitting=1)
+    checkpoint = train(config)
+    assert read(checkpoint)["step"] == 2
+    folder = tmp_path / "model"
+    command = ["export-official", str(checkpoint), str(folder), "--precision", "float32"]
+    assert main([*command, "--model", str(model)]) == 0
+    assert capsys.readouterr().out.strip() == str(folder)
+    for other, said in ((model, "already there"), (folder, "is the import itself")):
+        assert main([*command, "--model", str(other)]) == 2
+        assert said in capsys.readouterr().err
+    pipeline = OfficialPipeline.load(folder, threads=1)
+    avatar = pipeline.encode(read_image(PORTRAIT))
+    assert not avatar.offsets.any()
     assert pipeline.render(avatar).rgb.std() > 0

@@ -27,6 +27,7 @@ from cvthead.training import records
 from cvthead.training.config import TrainConfig, load_config, merged, setting
 from cvthead.training.dataset import PairDataset, flip_order, flip_points
 from cvthead.training.perceptual import perceptual_weights
+from cvthead.training.renderers import OpenRenderer
 from cvthead.training.train import train
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -114,6 +115,23 @@ def test_a_sample_depends_on_seed_and_number_alone(
     first, again, other = dataset(1)[3], dataset(1)[3], dataset(2)[3]
     assert all(torch.equal(first[name], again[name]) for name in first)
     assert not torch.equal(first["source"], other["source"])
+
+
+@pytest.mark.usefixtures("_perceptual")
+def test_half_precision_leaves_the_points_where_they_are(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kinds = []
+
+    def forward(self: OpenRenderer, batch: dict[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
+        kinds.append({batch[name].dtype for name in ("points", "driven", "warped")})
+        return original(self, batch)
+
+    original = OpenRenderer.forward
+    monkeypatch.setattr(OpenRenderer, "forward", forward)
+    values = small(folder, tmp_path / "run", steps=1, precision="bf16-mixed")
+    train(TrainConfig.model_validate(values))
+    assert kinds == [{torch.float32}]
 
 
 def test_without_deformation_no_shell_is_drawn(

@@ -9,7 +9,7 @@ from pathlib import Path
 from cvthead.cli.portrait import add_preset_option
 from cvthead.data.layout import TEST, VAL
 from cvthead.errors import InputError
-from cvthead.official.manifest import Manifest, default_folder
+from cvthead.official.manifest import default_folder
 from cvthead.runtime.threads import cores
 
 
@@ -71,13 +71,12 @@ def run(args: argparse.Namespace) -> None:
     # Only this command needs what is imported here.
     from cvthead.data.prepare import Settings, prepare
 
-    model, fingerprint = None, None
+    model = None
     if args.preset == "official":
         model = args.model or default_folder()
-        fingerprint = Manifest.load(model).fingerprint
     elif args.model:
         raise InputError("--model goes with --preset official", hint="leave it out, or add that")
-    settings = Settings(args.val, args.test, args.frames, args.crop, args.shard_size, fingerprint)
+    settings = Settings(args.val, args.test, args.frames, args.crop, args.shard_size)
     report = prepare(args.videos, args.out, settings, processes=args.processes, model=model)
     print(report.table())
     print(args.out)

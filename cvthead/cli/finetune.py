@@ -9,7 +9,6 @@ from pathlib import Path
 from cvthead.cli.portrait import add_preset_option
 from cvthead.cli.train import add_set_option, configuration, require
 from cvthead.errors import InputError
-from cvthead.official.manifest import Manifest
 from cvthead.runtime.threads import cores
 
 LIBRARIES = ("torch", "einops", "lightning_fabric", "tensorboard", "webdataset", "onnxscript")
@@ -19,9 +18,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser = commands.add_parser(
         "finetune",
         help="fit the networks to your own videos",
-        description="Prepare all videos and stills of a folder, train the shipped weights on them "
-        "a little further, and write the result to OUT/model, for --model of the other commands. "
-        "Called again, it goes on where it was interrupted.",
+        description="Prepare all videos and stills (official: videos alone) of a folder, train the "
+        "preset's weights on them a little further, and write the result to OUT/model, for --model "
+        "of the other commands. Called again, it goes on where it was interrupted.",
     )
     parser.add_argument(
         "videos", type=Path, metavar="VIDEOS", help="folder; one sub-folder per person"
@@ -58,21 +57,25 @@ def run(args: argparse.Namespace) -> None:
     records, model = args.out / "data" / "train", args.out / "model"
     given = {"data": records, "run": args.out / "run"}
     if args.preset == "official":
-        given |= {"preset": "official", "init": "imported"}
+        given["preset"] = args.preset
+        if not any(text.startswith("init=") for text in args.settings):
+            given["init"] = "imported"
     config = configuration(args, given)
     if config.preset == "paper":
         raise InputError(
             f"the runtime does not know the preset {config.preset}",
             hint="use a configuration of another preset",
         )
-    imported, fingerprint = None, None
-    if config.preset == "official":
-        imported = config.imported
-        fingerprint = Manifest.load(imported).fingerprint
+    if config.preset != args.preset:
+        raise InputError(
+            f"the configuration is of the preset {config.preset}",
+            hint=f"add --preset {config.preset}",
+        )
+    imported = config.imported if config.preset == "official" else None
     report = prepare(
         args.videos,
         args.out / "data",
-        Settings(val=0, test=0, official=fingerprint),
+        Settings(val=0, test=0),
         processes=args.processes,
         model=imported,
     )

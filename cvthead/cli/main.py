@@ -18,6 +18,7 @@ from cvthead.cli import (
     data,
     encode,
     evaluate,
+    export_official,
     finetune,
     import_official,
     render,
@@ -30,7 +31,7 @@ from cvthead.runtime.threads import one_thread_per_call
 
 COMMANDS = (
     *(encode, render, animate, track, sweep, bench, import_official),
-    *(data, train, finetune, evaluate),
+    *(data, train, finetune, export_official, evaluate),
 )
 FAILED = 2
 INTERRUPTED = 130  # what shells report for a command ended by Ctrl-C

@@ -72,5 +72,5 @@ def make_official_record(
         )
     if len(kept) < MIN_FRAMES:
         return Outcome(dropped=LOST if kept else NO_PERSON, frames_dropped=dict(dropped))
-    official_records.write(out, kept)
+    official_records.write(out, kept, pipeline.networks.manifest.tables)
     return Outcome(len(kept), frames_dropped=dict(dropped))

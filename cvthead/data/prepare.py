@@ -22,7 +22,7 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from multiprocessing import get_context, parent_process
 from os import _exit
@@ -39,6 +39,7 @@ from cvthead.data.tracking import CropStyle, Outcome, make_record
 from cvthead.deformation import DeformationModel
 from cvthead.errors import InputError
 from cvthead.files import write_errors, write_file
+from cvthead.official.manifest import Manifest
 from cvthead.official.pipeline import OfficialPipeline
 from cvthead.points import PointLayout
 from cvthead.runtime.threads import one_thread_per_call
@@ -55,8 +56,8 @@ class Settings:
         frames: sampled from each video.
         crop: see cvthead.data.tracking.make_record.
         shard_size: records per shard.
-        official: fingerprint of the import whose networks make records of the official preset;
-            None makes those of the open one.
+        official: see Manifest.tables, of the import whose networks make records of the preset
+            official; set by :func:`prepare`.
     """
 
     val: float = VAL
@@ -76,12 +77,16 @@ def prepare(
         videos: see cvthead.data.layout.
         out: new, or one of an earlier call with the same settings.
         processes: workers, one core each.
-        model: folder of the import that ``settings`` name.
+        model: folder of the import whose networks make records of the preset official; None makes
+            those of the open one.
 
     Raises:
+        AssetError: nothing was imported there, or a file of it is missing or altered.
         InputError: nothing to read, an output folder of other settings, no space, or a worker
             that the system has killed.
     """
+    if model is not None:
+        settings = replace(settings, official=Manifest.load(model).tables)
     items, others = find_items(videos, val=settings.val, test=settings.test)
     with write_errors(out):
         for name in (*SPLITS, "pending"):
@@ -148,7 +153,8 @@ def resume(out: Path, settings: Settings) -> dict[str, Outcome]:
     # A kill can cut the last line short; its file is done again.
     lines = [json.loads(line) for line in text[: text.rfind("\n") + 1].splitlines()]
     # A setting that is newer than the journal had its default's effect.
-    if not lines or asdict(Settings()) | lines[0].get("settings", {}) != head["settings"]:
+    made = lines[0].get("settings") if lines else None
+    if made is None or asdict(Settings()) | made != head["settings"]:
         raise InputError(
             f"{out} was made with other settings",
             hint="choose a new folder, or the settings in the first line of its journal.jsonl",

@@ -125,12 +125,12 @@ def check_output(output: Path, *, replace: bool) -> None:
     found = {path.name for path in output.iterdir()} if output.is_dir() else set()
     if found and not replace:
         raise InputError(
-            f"{output} is already there", hint="replace it with --replace, or choose another -o"
+            f"{output} is already there", hint="replace it with --replace, or choose another folder"
         )
     if others := found - {*FILES, *EIGHT_BIT.values(), RECORD}:
         raise InputError(
             f"{output} holds more than an import: {', '.join(sorted(others)[:5])}",
-            hint="choose another folder with -o",
+            hint="choose another folder",
         )
 
 

@@ -148,6 +148,13 @@ class Manifest:
             raise AssetError(f"{path} is not an imported model: {error!r}", hint=HINT) from error
         return cls(folder, fingerprint, sources, sha256, psnr, deformation)
 
+    @property
+    def tables(self) -> str:
+        """16 hex digits of all weights but CVTHead's own network: what its training rests on."""
+        names = (name for name in WEIGHTS if name != NETWORK)
+        digest = hashlib.sha256("".join(self.sha256[name] for name in names).encode())
+        return digest.hexdigest()[:16]
+
     def checked(self, name: str) -> Path:
         """Path of a file of the import, after comparing its hash.
 

@@ -139,8 +139,10 @@ class OfficialPipeline:
 
         Args:
             picture: with the whole head in view.
-            deform: False leaves out hair and shoulders.
+            deform: False leaves out hair and shoulders; a network that was retrained without them
+                has none.
         """
+        deform = deform and self.networks.manifest.deformation
         image, square = picture_array(picture.pixels), picture.square
         mask = self.mask(image)
         estimate = self.tracker.estimate(picture.pixels, square)

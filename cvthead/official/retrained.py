@@ -1,15 +1,9 @@
-"""Turn a training checkpoint of the preset official into a model folder of that preset.
-
-    python -m cvthead.official.retrained RUN/checkpoint.pt MODEL
-
-The folder is the import's with another CVTHead network: ``--model MODEL`` of the commands takes it.
-"""
+"""A training checkpoint of the preset official becomes a model folder of that preset: the import's
+with another CVTHead network."""
 
 from __future__ import annotations
 
-import argparse
 import shutil
-from collections.abc import Sequence
 from pathlib import Path
 
 from safetensors.torch import save_file
@@ -26,7 +20,6 @@ from cvthead.official.manifest import (
     WEIGHTS,
     Manifest,
     SourceFile,
-    default_folder,
     file_sha256,
     write_manifest,
 )
@@ -52,11 +45,13 @@ def export_retrained(
     Args:
         checkpoint: of a run of the preset official.
         output: new folder.
-        imported: folder of the import that the run took head and tables from.
+        imported: folder of the import that the run was made with, or of another network on the
+            same.
         replace, eight_bit: as :func:`cvthead.official.importer.import_official`.
 
     Raises:
-        InputError: not such a checkpoint, or ``output`` is there already or cannot be written.
+        InputError: not such a checkpoint, one of another import, or ``output`` is there already,
+            is ``imported``, or cannot be written.
         AssetError: ``imported`` is none or is damaged, or an ONNX file differs from PyTorch.
     """
     contents = read(checkpoint)
@@ -67,8 +62,15 @@ def export_retrained(
             f"{checkpoint} is of the preset {preset}, not official",
             hint="`python -m cvthead.training.export` exports the open preset's",
         )
-    check_output(output, replace=replace)
     manifest = Manifest.load(imported)
+    if config["tables"] != manifest.tables:
+        raise InputError(
+            f"{checkpoint} was not trained with the import in {imported}",
+            hint="name the import that made its records with --model",
+        )
+    if output.resolve() == imported.resolve():
+        raise InputError(f"{output} is the import itself", hint="choose another folder")
+    check_output(output, replace=replace)
     run = SourceFile(checkpoint.name, file_sha256(checkpoint), (RETRAINED,))
     sources = (*manifest.sources, run)
     new = atomic_path(output.resolve(), folder=True, replace=replace)
@@ -82,23 +84,3 @@ def export_retrained(
         if eight_bit:  # calibrated on what the float networks paint
             psnr = quantise(temporary)
             write_manifest(temporary, sources, psnr, deformation=deformation)
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("checkpoint", type=Path)
-    parser.add_argument("output", type=Path)
-    parser.add_argument("--model", type=Path, metavar="FOLDER", help="import that it trained on")
-    parser.add_argument("--replace", action="store_true", help="an earlier model gives way")
-    parser.add_argument("--precision", choices=("int8", "float32"), default="int8")
-    args = parser.parse_args(arguments)
-    eight_bit = args.precision == "int8"
-    imported = args.model or default_folder()
-    export_retrained(
-        args.checkpoint, args.output, imported, replace=args.replace, eight_bit=eight_bit
-    )
-    print(args.output)
-
-
-if __name__ == "__main__":
-    main()

@@ -26,12 +26,14 @@ class OfficialTables:
         head: FLAME.
         deform_mean, deform_basis: (5023, 3) and (5023, 3, 60) metres, of hair and shoulders.
         hierarchy: of the vertex upsampler.
+        fingerprint: see Manifest.tables.
     """
 
     head: HeadModel
     deform_mean: Array
     deform_basis: Array
     hierarchy: MeshHierarchy
+    fingerprint: str
 
     @classmethod
     def load(cls, folder: Path) -> OfficialTables:
@@ -44,7 +46,13 @@ class OfficialTables:
         try:
             flame, hair, mesh = (load_file(manifest.checked(n)) for n in (FLAME, HAIR, MESH))
             head = Flame(**flame).head()
-            return cls(head, hair["deform_mean"], hair["deform_basis"], stored_hierarchy(mesh))
+            return cls(
+                head,
+                hair["deform_mean"],
+                hair["deform_basis"],
+                stored_hierarchy(mesh),
+                manifest.tables,
+            )
         except (SafetensorError, TypeError, KeyError) as error:
             raise AssetError(f"{folder} does not fit this version: {error}", hint=HINT) from error
 

@@ -15,14 +15,15 @@ from torch.optim import Optimizer
 from torch.optim.swa_utils import AveragedModel
 
 from cvthead import weights
-from cvthead.errors import InputError
-from cvthead.official.manifest import NETWORK
+from cvthead.errors import AssetError, InputError
+from cvthead.official.manifest import NETWORK, Manifest
 from cvthead.runtime.model_folder import WEIGHTS, packaged
-from cvthead.training.config import TrainConfig
+from cvthead.training.config import IMPORTED, SHIPPED, TrainConfig
 from cvthead.training.discriminator import MultiScaleDiscriminator
 
-SHIPPED, IMPORTED, OPEN_PRESET = "shipped", "imported", "open"
+OPEN_PRESET = "open"
 NOT_A_CHECKPOINT = "give a run's checkpoint.pt"
+ANOTHER_NETWORK = "preset and weights must belong together"
 
 
 @dataclass
@@ -117,17 +118,23 @@ def start_from(config: TrainConfig, state: RunState) -> None:
 
     Raises:
         InputError: not such a file, or weights of another network.
+        AssetError: the imported weights are missing or altered.
     """
     assert config.init is not None
-    named = {SHIPPED: packaged(OPEN_PRESET) / WEIGHTS, IMPORTED: config.imported / NETWORK}
-    path = named.get(config.init, Path(config.init))
+    if config.init == IMPORTED:
+        path = Manifest.load(config.imported).checked(NETWORK)
+    else:
+        path = packaged(OPEN_PRESET) / WEIGHTS if config.init == SHIPPED else Path(config.init)
     if not path.is_file():
         raise InputError(
             f"there are no weights {path}",
             hint="give a checkpoint.pt, a weights.safetensors, `shipped`, or `imported`",
         )
     if path.suffix == ".safetensors":
-        weights.load_into(state.model, path)
+        try:
+            weights.load_into(state.model, path)
+        except AssetError as error:
+            raise InputError(f"{path} holds another network", hint=ANOTHER_NETWORK) from error
     else:
         contents = read(path)
         _load(state.model, contents["model"], path)
@@ -165,6 +172,4 @@ def _load(model: nn.Module, state: dict[str, Tensor], path: Path) -> None:
     try:
         model.load_state_dict(state)
     except RuntimeError as error:
-        raise InputError(
-            f"{path} holds another network", hint="preset and weights must belong together"
-        ) from error
+        raise InputError(f"{path} holds another network", hint=ANOTHER_NETWORK) from error

@@ -14,9 +14,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from cvthead.errors import InputError
 from cvthead.model.config import Features
-from cvthead.official.manifest import default_folder
+from cvthead.official.manifest import Manifest, default_folder
 
 ST_LPIPS = "st-lpips-alex"
+SHIPPED, IMPORTED = "shipped", "imported"  # weights to start from
 # What may change between two sittings of one run without changing its result.
 FREE = frozenset({"data", "model", "run", "init", "workers", "log_every", "save_every"})
 
@@ -129,8 +130,15 @@ class TrainConfig(Section):
     def _consistent(self) -> Self:
         if self.losses.identity and self.networks.identity is None:
             raise ValueError("losses.identity needs a file in networks.identity")
-        if self.model is not None and self.preset != "official":
-            raise ValueError("model is for the preset official")
+        if self.preset != "official":
+            if self.model is not None:
+                raise ValueError("model is for the preset official")
+            if self.init == IMPORTED:
+                raise ValueError("the imported weights are of the preset official")
+        elif self.labels is not None:
+            raise ValueError("the preset official learns from videos, which have no labels")
+        elif self.init == IMPORTED and self.features != "fused":
+            raise ValueError("the imported network has no ablation; remove init")
         if self.preset != "open" and self.features == "transformer":
             raise ValueError("the paper's network is the transformer; remove features")
         if self.stage == 2 and not self.losses.adversarial:
@@ -143,8 +151,14 @@ class TrainConfig(Section):
         return self.model or default_folder()
 
     def fixed(self) -> dict[str, Any]:
-        """What must stay the same when a run goes on, as plain values."""
-        return self.model_dump(mode="json", exclude=set(FREE))
+        """What must stay the same when a run goes on, as plain values.
+
+        Raises:
+            AssetError: preset official, and nothing was imported.
+        """
+        official = self.preset == "official"
+        tables = Manifest.load(self.imported).tables if official else None
+        return self.model_dump(mode="json", exclude=set(FREE)) | {"tables": tables}
 
 
 def load_config(name: str, given: Mapping[str, Any]) -> TrainConfig:

@@ -62,7 +62,7 @@ def averaged_model(state: Mapping[str, Any]) -> CVTHead:
     if config.get("preset", "open") != "open":
         raise InputError(
             f"a run of the preset {config['preset']} is not exported by this",
-            hint="paper has no runtime; official has `python -m cvthead.official.retrained`",
+            hint="paper has no runtime; `cvthead export-official` exports official",
         )
     network = replace(OPEN, features=config.get("features", "fused"))
     model = CVTHead(network, MeshHierarchy.load(), PointLayout.of(HeadModel.load()))

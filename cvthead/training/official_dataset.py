@@ -1,7 +1,7 @@
 """Training samples of the official preset: a frame of a video as source, others as drivers.
 
-As the paper trains (section 4.1): frames of one video, the source's shape on every driver, a
-random background behind the driven views. Nothing is augmented.
+As the paper trains: two frames of one video (section 3.5), the source's shape on every driver
+(equation 2). The random background is ours, the same as for the open preset. Nothing is augmented.
 """
 
 from __future__ import annotations
@@ -39,16 +39,17 @@ class OfficialPairDataset(Dataset[dict[str, Tensor]]):
         """Args:
         folder: records, see cvthead.training.official_records.
         tables: of the import that made them.
-        size: of the driven views, pixels.
+        size: of the driven views, pixels; below 256 they are shifted by up to half a pixel against
+            the splat, which rounds as the released code does.
         samples: length.
         deform: False leaves out hair and shoulders: the ablation without deformation.
 
         Raises:
-            InputError: no records in the folder, or those of the open preset.
+            InputError: no records in the folder, or not all of that import.
         """
         self.tables, self.size, self.seed, self.samples = tables, size, seed, samples
         self.deform = deform
-        self.stored = official_records(folder)
+        self.stored = official_records(folder, tables.fingerprint)
 
     def __len__(self) -> int:
         return self.samples
@@ -59,7 +60,7 @@ class OfficialPairDataset(Dataset[dict[str, Tensor]]):
         stored = self.stored[int(rng.integers(len(self.stored)))]
         record = OfficialRecord(stored.arrays())
         source, *drivers = (
-            record.frame(int(n)) for n in rng.integers(record.frames, size=1 + VIEWS)
+            record.frame(int(n)) for n in rng.choice(record.frames, 1 + VIEWS, replace=False)
         )
         background = rng.random((1, 3, 1, 1)).astype(np.float32)
         stack = {

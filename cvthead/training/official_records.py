@@ -18,8 +18,10 @@ from cvthead.coefficients import Array, Coefficients
 from cvthead.errors import InputError
 from cvthead.official.crop import FaceSquare
 from cvthead.training.records import (
+    MAKER,
     Arrays,
     StoredRecord,
+    makers,
     picture_arrays,
     stored_pictures,
     stored_records,
@@ -74,24 +76,31 @@ class OfficialRecord:
         )
 
 
-def official_records(folder: Path) -> list[StoredRecord]:
+def official_records(folder: Path, tables: str) -> list[StoredRecord]:
     """All records of a folder, by name.
 
+    Args:
+        folder: of the records.
+        tables: fingerprint of the import that should have made them, see Manifest.tables.
+
     Raises:
-        InputError: there are none, or they were made for the open preset.
+        InputError: there are none, or some were made for the open preset or with another import.
     """
     stored = stored_records(folder)
-    if "hair" not in stored[0].arrays():
-        raise InputError(
-            f"the records in {folder} were made for the open preset",
-            hint="make others with `cvthead data prepare --preset official VIDEOS OUT`",
-        )
+    for maker in makers(stored):
+        if maker != tables:
+            raise InputError(
+                f"{folder} has records of "
+                + (f"the import {maker}" if maker else "the open preset"),
+                hint="make others with `cvthead data prepare --preset official VIDEOS OUT`",
+            )
     return stored
 
 
-def write(path: Path, frames: Sequence[OfficialFrame]) -> None:
-    """Store the frames of one video."""
+def write(path: Path, frames: Sequence[OfficialFrame], tables: str) -> None:
+    """Store the frames of one video; ``tables`` as in :func:`official_records`."""
     arrays: Arrays = {
+        MAKER: np.array(tables),
         "shape": np.stack([f.coefficients.shape for f in frames]),
         "expression": np.stack([f.coefficients.expression for f in frames]),
         "pose": np.stack([f.coefficients.pose for f in frames]),

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from cvthead.errors import InputError
 from cvthead.source import HeadCrop, Source
 
 JPEG_QUALITY = 95
+MAKER = "import"  # entry of a record of the preset official
 
 Arrays = dict[str, NDArray[np.generic]]
 
@@ -156,15 +158,27 @@ def open_records(folder: Path) -> list[StoredRecord]:
     """As :func:`stored_records`, of the open preset.
 
     Raises:
-        InputError: as :func:`stored_records`, or they were made for the preset official.
+        InputError: as :func:`stored_records`, or some were made for the preset official.
     """
     stored = stored_records(folder)
-    if "sources" not in stored[0].arrays():
+    if any(makers(stored)):
         raise InputError(
-            f"the records in {folder} were made for the preset official",
+            f"{folder} has records of the preset official",
             hint="make others with `cvthead data prepare VIDEOS OUT`",
         )
     return stored
+
+
+def makers(stored: Sequence[StoredRecord]) -> set[str]:
+    """Fingerprints of the imports that made the records; "" is the open preset. All records of a
+    shard have one maker."""
+    found = set()
+    for record in {record.path: record for record in stored}.values():
+        # A file is opened without reading all of it.
+        file = record.path if record.path.suffix == ".npz" else io.BytesIO(record.read())
+        with np.load(file, allow_pickle=False) as archive:
+            found.add(str(archive[MAKER]) if MAKER in archive else "")
+    return found
 
 
 def records_hash(folder: Path) -> str:
