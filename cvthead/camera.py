@@ -102,7 +102,11 @@ class Crop:
         crop = cv2.warpAffine(
             image_small, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
-        centres = (np.arange(pixels) + 0.5) / zoom
-        x, y = self.left + centres, self.top + centres
-        valid = ((y >= 0) & (y <= image.shape[0]))[:, None] & ((x >= 0) & (x <= image.shape[1]))
+        valid = self.inside(image.shape[0], image.shape[1], pixels)
         return crop.astype(np.uint8, copy=False), valid
+
+    def inside(self, height: int, width: int, pixels: int = CROP_PIXELS) -> NDArray[np.bool_]:
+        """(pixels, pixels) of the resampled crop, False beyond an image of this size."""
+        centres = (np.arange(pixels) + 0.5) / (pixels / self.size)
+        x, y = self.left + centres, self.top + centres
+        return ((y >= 0) & (y <= height))[:, None] & ((x >= 0) & (x <= width))

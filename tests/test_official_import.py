@@ -124,7 +124,7 @@ def test_everything_wrong_with_a_head_model_is_named(tmp_path: Path) -> None:
     path.write_bytes(pickle.dumps(tables))
     with pytest.raises(AssetError) as caught:
         read_model(path)
-    assert str(caught.value).split("(7 differences): ")[1].split("; ") == [
+    assert listed(caught.value, 7) == [
         "posedirs is missing",
         "shapedirs has shape (5023, 3, 150), not (5023, 3, 400)",
         "J_regressor has shape (), not (5, 5023)",
@@ -135,6 +135,11 @@ def test_everything_wrong_with_a_head_model_is_named(tmp_path: Path) -> None:
     ]
 
 
+def listed(error: AssetError, count: int) -> list[str]:
+    """The differences of a file that has so many."""
+    return str(error).split(f"({count} differences): ")[1].split("; ")
+
+
 def test_everything_wrong_with_a_landmark_file_is_named(tmp_path: Path) -> None:
     # As an array it is expected, as a tensor not read.
     tensors: dict[str, Any] = made_official.flame_state()
@@ -143,7 +148,7 @@ def test_everything_wrong_with_a_landmark_file_is_named(tmp_path: Path) -> None:
     made_official.write_landmarks(tmp_path / "landmarks.npy", tensors)
     with pytest.raises(AssetError) as caught:
         read_landmarks(tmp_path / "landmarks.npy")
-    assert str(caught.value).split("(2 differences): ")[1].split("; ") == [
+    assert listed(caught.value, 2) == [
         "static_lmk_bary_coords has shape (50, 3), not (51, 3)",
         "full_lmk_faces_idx has shape (), not (1, 68)",
     ]
@@ -162,7 +167,7 @@ def test_everything_wrong_with_the_transforms_is_named(tmp_path: Path) -> None:
     path.write_bytes(pickle.dumps(tables))
     with pytest.raises(AssetError) as caught:
         read_hierarchy(path)
-    assert str(caught.value).split("(6 differences): ")[1].split("; ") == [
+    assert listed(caught.value, 6) == [
         "vertices[4] is missing",
         "up_transform[4] is unknown",
         "face[3] has shape (138, 3), not (139, 3)",

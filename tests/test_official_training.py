@@ -32,7 +32,7 @@ from cvthead.training.config import TrainConfig, load_config
 from cvthead.training.dataset import VIEWS
 from cvthead.training.export import averaged_model
 from cvthead.training.official_dataset import OfficialPairDataset
-from cvthead.training.official_records import OfficialFrame, OfficialRecord, official_records
+from cvthead.training.official_records import OfficialFrame, official_records, stored_frame
 from cvthead.training.renderers import paper_renderer, training_parts
 from cvthead.training.train import train
 from cvthead.video_writer import video_writer
@@ -113,11 +113,11 @@ def test_a_record_holds_what_encoding_asks_the_networks(data: Path, model: Path)
     report = json.loads((data / "report.json").read_text())
     assert report["dropped"] == {"a still": 1}
     assert report["kept"]["train"] == {"records": 1, "frames": FRAMES, "identities": 1}
-    (stored,) = official_records(data / "train", Manifest.load(model).tables)
+    (stored,) = official_records(data / "train", Manifest.load(model).tables_fingerprint)
     assert stored.frames == FRAMES
     pipeline, tables = OfficialPipeline.load(model, threads=1), OfficialTables.load(model)
-    record = OfficialRecord(stored.arrays())
-    frames = [record.frame(number) for number in range(FRAMES)]
+    arrays = stored.arrays()
+    frames = [stored_frame(arrays, number) for number in range(FRAMES)]
     assert len({frame.square for frame in frames}) > 1
     for frame in frames[:2]:
         assert np.isin(frame.mask, (0, 1)).all()
@@ -163,8 +163,8 @@ def test_points_lie_where_the_released_code_puts_them(data: Path, model: Path) -
 
 
 def two_frames(dataset: OfficialPairDataset) -> tuple[OfficialFrame, OfficialFrame]:
-    record = OfficialRecord(dataset.stored[0].arrays())
-    return record.frame(0), record.frame(3)
+    arrays = dataset.stored[0].arrays()
+    return stored_frame(arrays, 0), stored_frame(arrays, 3)
 
 
 def test_samples_are_frames_of_one_video(data: Path, model: Path) -> None:
@@ -175,9 +175,9 @@ def test_samples_are_frames_of_one_video(data: Path, model: Path) -> None:
     assert first["source"].shape == (4, CROP_PIXELS, CROP_PIXELS)
     assert first["driven"].shape == (VIEWS, VERTICES, 3)
     assert first["image"].shape == (VIEWS, 3, 64, 64)
-    record = OfficialRecord(dataset.stored[0].arrays())
+    arrays = dataset.stored[0].arrays()
     # The encoder sees the picture over its own background.
-    pictures = [picture_array(record.frame(number).image)[0] for number in range(FRAMES)]
+    pictures = [picture_array(stored_frame(arrays, number).image)[0] for number in range(FRAMES)]
     assert any(np.array_equal(first["source"][:3], picture) for picture in pictures)
     for number in range(len(dataset)):
         sample = dataset[number]
@@ -233,7 +233,7 @@ def test_presets_do_not_mix(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     make_records(tmp_path)
-    tables = Manifest.load(model).tables
+    tables = Manifest.load(model).tables_fingerprint
     with pytest.raises(InputError, match="records of the open preset"):
         official_records(tmp_path, tables)
     with pytest.raises(InputError, match=f"records of the import {tables}"):

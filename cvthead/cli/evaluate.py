@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -116,8 +116,9 @@ def run(args: argparse.Namespace) -> None:
     from cvthead.training.perceptual import STLPIPS
 
     networks = UserNetworks.load(**{name: getattr(args, f"{name}_network") for name in NETWORKS})
-    pipelines = load_models(args.preset, args.model)
-    haired = has_deformation(args.preset, args.model)
+    folders = named_folders(args.model)
+    pipelines = load_models(args.preset, folders)
+    haired = has_deformation(args.preset, folders)
     methods = {
         name: trained(pipeline, deform=haired.get(name, True))
         for name, pipeline in pipelines.items()
@@ -149,26 +150,23 @@ def run(args: argparse.Namespace) -> None:
     print(args.output / "index.html")
 
 
-def load_models(preset: str, models: Sequence[str]) -> dict[str, Preset[Any]]:
+def load_models(preset: str, folders: Mapping[str, Path]) -> dict[str, Preset[Any]]:
     """By the name of the method.
 
     Args:
         preset: of all of them.
-        models: ``NAME=FOLDER``; empty for the model that the preset loads.
+        folders: by name; empty for the model that the preset loads.
 
     Raises:
-        InputError: as named_folders.
         AssetError: as load_preset.
     """
-    if not models:
+    if not folders:
         return {"CVTHead" if preset == "open" else f"CVTHead, {preset}": load_preset(preset)}
-    folders = named_folders(models)
     return {name: load_preset(preset, model=folder) for name, folder in folders.items()}
 
 
-def has_deformation(preset: str, models: Sequence[str]) -> dict[str, bool]:
+def has_deformation(preset: str, folders: Mapping[str, Path]) -> dict[str, bool]:
     """Whether the models of :func:`load_models` were trained with hair and shoulders."""
-    folders = named_folders(models)
     if preset == "official":
         return {name: Manifest.load(folder).deformation for name, folder in folders.items()}
     return {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from cvthead.cli.import_official import add_output_options
 from cvthead.cli.train import require
 from cvthead.official.manifest import default_folder
 
@@ -23,17 +24,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument(
         "--model", type=Path, metavar="FOLDER", help="import that the run was made with"
     )
-    parser.add_argument(
-        "--replace",
-        action="store_true",
-        help="an earlier model in that folder gives way once the new one is complete",
-    )
-    parser.add_argument(
-        "--precision",
-        choices=("int8", "float32"),
-        default="int8",
-        help="as import-official has it (default: int8)",
-    )
+    add_output_options(parser)
     parser.set_defaults(run=run)
 
 

@@ -38,19 +38,24 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         metavar="FOLDER",
         help=f"new folder for the converted model (default: {default_folder()})",
     )
+    add_output_options(parser)
+    parser.set_defaults(run=run)
+
+
+def add_output_options(parser: argparse.ArgumentParser) -> None:
+    """How a model folder is written."""
     parser.add_argument(
         "--replace",
         action="store_true",
-        help="an earlier import in that folder gives way once the new one is complete",
+        help="an earlier model in that folder gives way once the new one is complete",
     )
     parser.add_argument(
         "--precision",
         choices=("int8", "float32"),
         default="int8",
         help="int8 (default) serves U-Net and image encoder in 8 bits where their pictures are "
-        "close enough to the float ones; float32 serves everything as released",
+        "close enough to the float ones; float32 serves everything as it was trained",
     )
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> None:

@@ -4,16 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cvthead.data.tracking import (
-    LOST,
-    MIN_FRAMES,
-    MIN_PERSON,
-    NO_PERSON,
-    CropStyle,
-    Outcome,
-    clip_crop,
-    read_tracked,
-)
+from cvthead.data.tracking import MIN_PERSON, NO_PERSON, CropStyle, Outcome, read_tracked
 from cvthead.official.networks import picture_array
 from cvthead.official.pipeline import OfficialPipeline
 from cvthead.training import official_records
@@ -43,19 +34,16 @@ def make_official_record(
     if not is_video:
         return Outcome(dropped=STILL)
     tracker = pipeline.tracker
-    found = read_tracked(tracker.finder, path, is_video=True, frames=frames)
+    found = read_tracked(tracker.finder, path, is_video=True, frames=frames, crop=crop)
     if isinstance(found, Outcome):
         return found
-    tracked, dropped = found
-    one = clip_crop(tracker.finder, [face for _, face in tracked]) if crop == "clip" else None
     kept = []
-    for image, face in tracked:
-        picture = tracker.cut(image, face, one)
-        _, valid = picture.crop.cut(image)
+    for image, face in found.faces:
+        picture = tracker.cut(image, face, found.square)
         array = picture_array(picture.pixels)
         mask = pipeline.mask(array)[0, 0]
         if mask.mean() < MIN_PERSON:
-            dropped[NO_PERSON] += 1
+            found.dropped[NO_PERSON] += 1
             continue
         square = picture.square
         estimate = tracker.estimate(picture.pixels, square)
@@ -63,14 +51,14 @@ def make_official_record(
             OfficialFrame(
                 picture.pixels,
                 mask,
-                valid,
+                picture.crop.inside(image.shape[0], image.shape[1]),
                 estimate.coefficients,
                 square.camera(estimate.cam),
                 square,
                 pipeline.hair(array),
             )
         )
-    if len(kept) < MIN_FRAMES:
-        return Outcome(dropped=LOST if kept else NO_PERSON, frames_dropped=dict(dropped))
-    official_records.write(out, kept, pipeline.networks.manifest.tables)
-    return Outcome(len(kept), frames_dropped=dict(dropped))
+    if outcome := found.too_few(len(kept), is_video=True):
+        return outcome
+    official_records.write(out, kept, pipeline.networks.manifest.tables_fingerprint)
+    return Outcome(len(kept), frames_dropped=dict(found.dropped))

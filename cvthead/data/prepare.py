@@ -56,8 +56,8 @@ class Settings:
         frames: sampled from each video.
         crop: see cvthead.data.tracking.make_record.
         shard_size: records per shard.
-        official: see Manifest.tables, of the import whose networks make records of the preset
-            official; set by :func:`prepare`.
+        official: Manifest.tables_fingerprint of the import whose networks make records of the
+            preset official; set by :func:`prepare`.
     """
 
     val: float = VAL
@@ -86,7 +86,7 @@ def prepare(
             that the system has killed.
     """
     if model is not None:
-        settings = replace(settings, official=Manifest.load(model).tables)
+        settings = replace(settings, official=Manifest.load(model).tables_fingerprint)
     items, others = find_items(videos, val=settings.val, test=settings.test)
     with write_errors(out):
         for name in (*SPLITS, "pending"):

@@ -109,10 +109,31 @@ def clip_crop(tracker: Tracker, faces: Sequence[TrackedFace]) -> Crop:
     return Crop(float((left + right - size) / 2), float((top + bottom - size) / 2), float(size))
 
 
+@dataclass(frozen=True)
+class TrackedFile:
+    """What of a file is tracked well.
+
+    Attributes:
+        faces: frames and their faces, one or more.
+        square: that all frames are cut to; None cuts each to its own head.
+        dropped: frames left out, by reason; those who go on count theirs in it.
+    """
+
+    faces: Sequence[tuple[Image, TrackedFace]]
+    square: Crop | None
+    dropped: Counter[str]
+
+    def too_few(self, kept: int, *, is_video: bool) -> Outcome | None:
+        """What becomes of the file if only so many frames could be cut; None: it goes on."""
+        if kept >= (MIN_FRAMES if is_video else 1):
+            return None
+        return Outcome(dropped=LOST if kept else NO_PERSON, frames_dropped=dict(self.dropped))
+
+
 def read_tracked(
-    tracker: Tracker, path: Path, *, is_video: bool, frames: int
-) -> tuple[list[tuple[Image, TrackedFace]], Counter[str]] | Outcome:
-    """As :func:`track_frames`, of a file; or why it is of no use."""
+    tracker: Tracker, path: Path, *, is_video: bool, frames: int, crop: CropStyle
+) -> TrackedFile | Outcome:
+    """Track a file, or say why it is of no use; arguments as :func:`make_record`."""
     try:
         images = sampled_frames(path, frames) if is_video else [read_image(path)]
     except CVTHeadError:
@@ -122,7 +143,8 @@ def read_tracked(
     tracked, dropped = track_frames(tracker, images)
     if not tracked:
         return Outcome(dropped=dropped.most_common(1)[0][0], frames_dropped=dict(dropped))
-    return tracked, dropped
+    square = clip_crop(tracker, [face for _, face in tracked]) if crop == "clip" else None
+    return TrackedFile(tracked, square, dropped)
 
 
 def make_record(
@@ -147,21 +169,18 @@ def make_record(
             square of 0.36 m fixed to the face of each frame, so that training and use agree.
             "clip" is FOMM's and the paper's: one square per clip, within which the head moves.
     """
-    found = read_tracked(tracker, path, is_video=is_video, frames=frames)
+    found = read_tracked(tracker, path, is_video=is_video, frames=frames, crop=crop)
     if isinstance(found, Outcome):
         return found
-    tracked, dropped = found
-    square = clip_crop(tracker, [face for _, face in tracked]) if crop == "clip" else None
+    dropped = found.dropped
     heads = []
-    for head in _cut(tracker, tracked, square):
+    for head in _cut(tracker, found.faces, found.square):
         if head is not None and head.mask.mean() >= MIN_PERSON:
             heads.append(head)
         else:
             dropped[NO_PERSON] += 1
-    if is_video and 0 < len(heads) < MIN_FRAMES:
-        return Outcome(dropped=LOST, frames_dropped=dict(dropped))
-    if not heads:
-        return Outcome(dropped=NO_PERSON, frames_dropped=dict(dropped))
+    if outcome := found.too_few(len(heads), is_video=is_video):
+        return outcome
     sources = {}
     chosen = np.unique(np.linspace(0, len(heads) - 1, SOURCES_PER_CLIP).astype(int))
     for number in chosen.tolist():

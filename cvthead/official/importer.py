@@ -38,7 +38,7 @@ from cvthead.official.manifest import (
 )
 from cvthead.official.mesh import read_hierarchy
 from cvthead.official.parts import PARTS, State
-from cvthead.official.quantise import quantise
+from cvthead.official.quantise import add_eight_bit
 from cvthead.official.release import PLACES, Release
 
 Files = Mapping[str, Mapping[str, Tensor]]
@@ -78,8 +78,8 @@ def import_official(
     new = atomic_path(output.resolve(), folder=True, replace=replace)
     with new as temporary, write_errors(output):
         write_model(temporary, files, sources)
-        if eight_bit:  # calibrated on what the float networks paint
-            write_manifest(temporary, sources, quantise(temporary))
+        if eight_bit:
+            add_eight_bit(temporary)
     return sources
 
 

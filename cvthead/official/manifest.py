@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,8 @@ HAIR = "hair.safetensors"
 DECA = "deca.safetensors"
 FLAME = "flame.safetensors"
 MESH = "mesh.safetensors"
-WEIGHTS = (NETWORK, PARSING, HAIR, DECA, FLAME, MESH)
+TABLES = (PARSING, HAIR, DECA, FLAME, MESH)  # what training CVTHead leaves as it is
+WEIGHTS = (NETWORK, *TABLES)
 # The networks as they are served, made from the weights.
 PARSING_ONNX = "face_parsing.onnx"
 HAIR_ONNX = "hair.onnx"
@@ -149,11 +150,9 @@ class Manifest:
         return cls(folder, fingerprint, sources, sha256, psnr, deformation)
 
     @property
-    def tables(self) -> str:
+    def tables_fingerprint(self) -> str:
         """16 hex digits of all weights but CVTHead's own network: what its training rests on."""
-        names = (name for name in WEIGHTS if name != NETWORK)
-        digest = hashlib.sha256("".join(self.sha256[name] for name in names).encode())
-        return digest.hexdigest()[:16]
+        return _fingerprint(self.sha256, TABLES)
 
     def checked(self, name: str) -> Path:
         """Path of a file of the import, after comparing its hash.
@@ -185,12 +184,11 @@ def write_manifest(
     """
     names = [*FILES, *(name for name in EIGHT_BIT.values() if (folder / name).is_file())]
     sha256 = {name: file_sha256(folder / name) for name in names}
-    # Of the weights alone: an avatar stays what it is when the networks are exported anew.
-    digest = hashlib.sha256("".join(sha256[name] for name in WEIGHTS).encode())
     record = {
         "preset": PRESET,
         "version": VERSION,
-        "fingerprint": digest.hexdigest()[:16],
+        # Of the weights alone: an avatar stays what it is when the networks are exported anew.
+        "fingerprint": _fingerprint(sha256, WEIGHTS),
         "sources": [asdict(source) for source in sources],
         "licences": [asdict(licence) for licence in LICENCES],
         "psnr": dict(psnr or {}),
@@ -198,6 +196,11 @@ def write_manifest(
         "sha256": sha256,
     }
     write_file(folder / RECORD, (json.dumps(record, indent=2) + "\n").encode())
+
+
+def _fingerprint(sha256: Mapping[str, str], names: Sequence[str]) -> str:
+    digest = hashlib.sha256("".join(sha256[name] for name in names).encode())
+    return digest.hexdigest()[:16]
 
 
 def file_sha256(path: Path) -> str:

@@ -21,6 +21,8 @@ from cvthead.official.manifest import (
     EIGHT_BIT,
     MIN_PSNR,
     UNET_ONNX,
+    Manifest,
+    write_manifest,
 )
 from cvthead.official.networks import Network, picture_array
 from cvthead.official.pipeline import OfficialPipeline
@@ -54,6 +56,13 @@ LARGEST_JAW = 0.4
 
 Array = NDArray[np.float32]
 Image = NDArray[np.uint8]
+
+
+def add_eight_bit(folder: Path) -> None:
+    """:func:`quantise` a complete model, and let its record vouch for what came of it."""
+    model = Manifest.load(folder)
+    # Calibrated on what the float networks paint, so that these come first.
+    write_manifest(folder, model.sources, quantise(folder), deformation=model.deformation)
 
 
 def quantise(folder: Path) -> dict[str, float]:

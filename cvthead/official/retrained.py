@@ -17,19 +17,19 @@ from cvthead.official.manifest import (
     HAIR_ONNX,
     NETWORK,
     PARSING_ONNX,
-    WEIGHTS,
+    TABLES,
     Manifest,
     SourceFile,
     file_sha256,
     write_manifest,
 )
-from cvthead.official.quantise import quantise
+from cvthead.official.quantise import add_eight_bit
 from cvthead.official.torch_networks import TorchNetworks
 from cvthead.training.checkpoint import averaged, read
 
 RETRAINED = "CVTHead, retrained"
 # Files of the import that training does not touch.
-KEPT = (*(name for name in WEIGHTS if name != NETWORK), PARSING_ONNX, HAIR_ONNX, DECA_ONNX)
+KEPT = (*TABLES, PARSING_ONNX, HAIR_ONNX, DECA_ONNX)
 
 
 def export_retrained(
@@ -63,7 +63,7 @@ def export_retrained(
             hint="`python -m cvthead.training.export` exports the open preset's",
         )
     manifest = Manifest.load(imported)
-    if config["tables"] != manifest.tables:
+    if config["tables"] != manifest.tables_fingerprint:
         raise InputError(
             f"{checkpoint} was not trained with the import in {imported}",
             hint="name the import that made its records with --model",
@@ -81,6 +81,5 @@ def export_retrained(
         save_file(state, temporary / NETWORK)
         export_network(temporary, TorchNetworks.load(temporary))
         write_manifest(temporary, sources, deformation=deformation)
-        if eight_bit:  # calibrated on what the float networks paint
-            psnr = quantise(temporary)
-            write_manifest(temporary, sources, psnr, deformation=deformation)
+        if eight_bit:
+            add_eight_bit(temporary)

@@ -26,7 +26,7 @@ class OfficialTables:
         head: FLAME.
         deform_mean, deform_basis: (5023, 3) and (5023, 3, 60) metres, of hair and shoulders.
         hierarchy: of the vertex upsampler.
-        fingerprint: see Manifest.tables.
+        fingerprint: see Manifest.tables_fingerprint.
     """
 
     head: HeadModel
@@ -51,7 +51,7 @@ class OfficialTables:
                 hair["deform_mean"],
                 hair["deform_basis"],
                 stored_hierarchy(mesh),
-                manifest.tables,
+                manifest.tables_fingerprint,
             )
         except (SafetensorError, TypeError, KeyError) as error:
             raise AssetError(f"{folder} does not fit this version: {error}", hint=HINT) from error

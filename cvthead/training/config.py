@@ -157,7 +157,7 @@ class TrainConfig(Section):
             AssetError: preset official, and nothing was imported.
         """
         official = self.preset == "official"
-        tables = Manifest.load(self.imported).tables if official else None
+        tables = Manifest.load(self.imported).tables_fingerprint if official else None
         return self.model_dump(mode="json", exclude=set(FREE)) | {"tables": tables}
 
 

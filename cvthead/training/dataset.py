@@ -6,6 +6,7 @@ mirrored face, seen from the other side, is what the hidden half should look lik
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -172,11 +173,9 @@ class PairDataset(Dataset[dict[str, Tensor]]):
                 ]
             ),
             "background": np.full((VIEWS, 3, 1, 1), 1, np.float32) * rng.random((1, 3, 1, 1)),
-            "image": np.stack([self._resized(v.image).transpose(2, 0, 1) for v in views]),
-            "mask": np.stack([self._resized(v.mask)[None] for v in views]),
-            "valid": np.stack([self._resized(v.valid)[None] > 0.99 for v in views]),
             "driven": np.stack(driven),
             "warped": np.stack([as_network_input(each.warped) for each in placed]),
+            **targets(views, self.size),
         }
         return {
             name: torch.from_numpy(
@@ -191,11 +190,26 @@ class PairDataset(Dataset[dict[str, Tensor]]):
         nothing = np.empty((len(driven), 0), np.uint8)
         return place(self.layout, driven, at, nothing, portrait, splat_size)
 
-    def _resized(self, image: Array) -> Array:
-        if image.shape[0] == self.size:
-            return image
-        size = (self.size, self.size)
-        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
+
+def targets(views: Sequence[View], size: int) -> dict[str, Array]:
+    """What rendered views of this size are compared with: image (v, 3, s, s) in 0..1, mask and
+    valid (v, 1, s, s)."""
+
+    def stacked(images: Iterable[Array]) -> Array:
+        sized = (resized(image, size).reshape(size, size, -1) for image in images)
+        return np.stack([image.transpose(2, 0, 1) for image in sized])
+
+    return {
+        "image": stacked(view.image for view in views),
+        "mask": stacked(view.mask for view in views),
+        "valid": (stacked(view.valid for view in views) > 0.99).astype(np.float32),
+    }
+
+
+def resized(image: Array, size: int) -> Array:
+    if image.shape[0] == size:
+        return image
+    return np.asarray(cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def without_shell(at: Array, layout: PointLayout) -> Array:

@@ -19,8 +19,8 @@ from cvthead.coefficients import Array
 from cvthead.official.networks import picture_array
 from cvthead.official.projection import project
 from cvthead.official.tables import OfficialTables
-from cvthead.training.dataset import VIEWS
-from cvthead.training.official_records import OfficialFrame, OfficialRecord, official_records
+from cvthead.training.dataset import VIEWS, as_view, targets
+from cvthead.training.official_records import OfficialFrame, official_records, stored_frame
 
 
 class OfficialPairDataset(Dataset[dict[str, Tensor]]):
@@ -58,21 +58,23 @@ class OfficialPairDataset(Dataset[dict[str, Tensor]]):
         cv2.setNumThreads(1)
         rng = np.random.default_rng((self.seed, index))
         stored = self.stored[int(rng.integers(len(self.stored)))]
-        record = OfficialRecord(stored.arrays())
+        arrays = stored.arrays()
         source, *drivers = (
-            record.frame(int(n)) for n in rng.choice(record.frames, 1 + VIEWS, replace=False)
+            stored_frame(arrays, int(n))
+            for n in rng.choice(stored.frames, 1 + VIEWS, replace=False)
         )
+        views = [as_view(driver, self.points(source, driver)) for driver in drivers]
         background = rng.random((1, 3, 1, 1)).astype(np.float32)
         stack = {
             "source": np.concatenate([picture_array(source.image)[0], source.mask[None]]),
             "points": self.points(source, source),
             "background": np.repeat(background, VIEWS, axis=0),
-            "driven": np.stack([self.points(source, driver) for driver in drivers]),
-            "image": np.stack([self._image(driver) for driver in drivers]),
-            "mask": np.stack([self._resized(driver.mask)[None] for driver in drivers]),
-            "valid": np.stack([self._valid(driver)[None] for driver in drivers]),
+            "driven": np.stack([view.points for view in views]),
+            **targets(views, self.size),
         }
-        return {name: torch.from_numpy(value) for name, value in stack.items()}
+        return {
+            name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in stack.items()
+        }
 
     def points(self, source: OfficialFrame, driver: OfficialFrame) -> Array:
         """(5023, 3) the source's head and hair, moved as the driver's and seen where it is."""
@@ -81,17 +83,3 @@ class OfficialPairDataset(Dataset[dict[str, Tensor]]):
             offsets = np.zeros_like(offsets)
         posed = replace(driver.coefficients, shape=source.coefficients.shape)
         return project(self.tables.head, posed, driver.camera, offsets, driver.square)
-
-    def _image(self, frame: OfficialFrame) -> Array:
-        scaled = frame.image.astype(np.float32) / np.float32(255)
-        return np.ascontiguousarray(self._resized(scaled).transpose(2, 0, 1))
-
-    def _valid(self, frame: OfficialFrame) -> Array:
-        inside = self._resized(frame.valid.astype(np.float32)) > 0.99
-        return inside.astype(np.float32)
-
-    def _resized(self, image: Array) -> Array:
-        if image.shape[0] == self.size:
-            return image
-        size = (self.size, self.size)
-        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cvthead.camera import Camera
 from cvthead.coefficients import Array, Coefficients
@@ -20,6 +19,7 @@ from cvthead.official.crop import FaceSquare
 from cvthead.training.records import (
     MAKER,
     Arrays,
+    Frame,
     StoredRecord,
     makers,
     picture_arrays,
@@ -30,50 +30,30 @@ from cvthead.training.records import (
 
 
 @dataclass(frozen=True, eq=False)
-class OfficialFrame:
-    """A stored frame.
+class OfficialFrame(Frame):
+    """A stored frame; mask by face parsing, 0 or 1, coefficients of FLAME.
 
     Attributes:
-        image: (256, 256, 3) uint8 RGB.
-        mask: (256, 256) float32 of 0 and 1, face parsing's.
-        valid: (256, 256) bool, False beyond the video's picture.
-        coefficients: of FLAME.
-        camera: in the picture's normalised coordinates.
         square: what DECA saw of the picture.
         hair: (60,) coefficients of hair and shoulders.
     """
 
-    image: NDArray[np.uint8]
-    mask: Array
-    valid: NDArray[np.bool_]
-    coefficients: Coefficients
-    camera: Camera
     square: FaceSquare
     hair: Array
 
 
-@dataclass(frozen=True, eq=False)
-class OfficialRecord:
-    """An open record; frames are decoded when asked for."""
-
-    arrays: Arrays
-
-    @property
-    def frames(self) -> int:
-        return len(self.arrays["pose"])
-
-    def frame(self, number: int) -> OfficialFrame:
-        a = self.arrays
-        shape, expression, pose, hair = (
-            a[name][number].astype(np.float32) for name in ("shape", "expression", "pose", "hair")
-        )
-        return OfficialFrame(
-            *stored_pictures(a, number),
-            Coefficients(shape, expression, pose),
-            Camera(*a["camera"][number].tolist()),
-            FaceSquare(*a["square"][number].tolist()),
-            hair,
-        )
+def stored_frame(arrays: Arrays, number: int) -> OfficialFrame:
+    """A frame of a record."""
+    shape, expression, pose, hair = (
+        arrays[name][number].astype(np.float32) for name in ("shape", "expression", "pose", "hair")
+    )
+    return OfficialFrame(
+        *stored_pictures(arrays, number),
+        Coefficients(shape, expression, pose),
+        Camera(*arrays["camera"][number].tolist()),
+        FaceSquare(*arrays["square"][number].tolist()),
+        hair,
+    )
 
 
 def official_records(folder: Path, tables: str) -> list[StoredRecord]:
@@ -81,7 +61,7 @@ def official_records(folder: Path, tables: str) -> list[StoredRecord]:
 
     Args:
         folder: of the records.
-        tables: fingerprint of the import that should have made them, see Manifest.tables.
+        tables: Manifest.tables_fingerprint of the import that should have made them.
 
     Raises:
         InputError: there are none, or some were made for the open preset or with another import.

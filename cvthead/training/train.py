@@ -206,9 +206,8 @@ def batches(
 
 def per_view(batch: Batch) -> dict[str, Tensor]:
     """What the losses compare with, by view."""
-    views = {name: batch[name] for name in PER_VIEW if name in batch}
-    views = {name: rearrange(value, "b v ... -> (b v) ...") for name, value in views.items()}
-    return views | {name: batch[name] for name in ("window",) if name in batch}
+    views = {n: rearrange(v, "b v ... -> (b v) ...") for n, v in batch.items() if n in PER_VIEW}
+    return views | {name: value for name, value in batch.items() if name == "window"}
 
 
 def descend(

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import re
 import socket
 from typing import Any
 
 import pytest
+from raw_problem import checked_problem
 from server_process import Server
-
-from service.problem_codes import PROBLEMS
 
 STREAM = b"/v1/avatars/0/stream"
 UPGRADE = b"Host: localhost\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
@@ -48,12 +46,7 @@ def wait_for_requests(server: Server, count: int) -> None:
 def problem(found: list[tuple[list[str], str]], code: str) -> tuple[dict[str, Any], list[str]]:
     """The one problem that was answered, and its header lines."""
     ((lines, body),) = found
-    assert lines[0].startswith(f"http/1.1 {PROBLEMS[code].status} ")
-    assert "content-type: application/problem+json" in lines
-    assert "connection: close" in lines
-    said: dict[str, Any] = json.loads(body)
-    assert (said["code"], said["status"]) == (code, PROBLEMS[code].status)
-    assert said["hint"]
+    said = checked_problem(lines, body, code)
     assert f"x-request-id: {said['request_id']}" in lines
     return said, lines
 

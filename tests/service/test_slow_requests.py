@@ -12,10 +12,9 @@ from typing import Any
 
 import httpx
 import pytest
+from raw_problem import checked_problem
 from raw_stream import coefficients, raw_stream
 from server_process import PORTRAIT, Server, start_server
-
-from service.problem_codes import PROBLEMS
 
 SECONDS = 1.5
 PAUSE = 0.1
@@ -54,15 +53,7 @@ def trickled(link: socket.socket, byte: bytes) -> bytes:
 
 def problem(answer: bytes, code: str) -> dict[str, Any]:
     head, _, body = answer.partition(b"\r\n\r\n")
-    lines = head.decode().lower().split("\r\n")
-    assert lines[0].startswith(f"http/1.1 {PROBLEMS[code].status} ")
-    assert "content-type: application/problem+json" in lines
-    assert "connection: close" in lines
-    found: dict[str, Any] = json.loads(body)
-    assert (found["code"], found["status"]) == (code, PROBLEMS[code].status)
-    assert found["hint"]
-    assert found["request_id"]
-    return found
+    return checked_problem(head.decode().lower().split("\r\n"), body, code)
 
 
 @pytest.mark.parametrize(
