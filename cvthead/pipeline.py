@@ -127,7 +127,9 @@ class Pipeline:
         """
         tracked = self.tracker.track(image, face=face, only_one=only_one)
         crop = cut_head(self.tracker, image, tracked)
-        source = read_source(self.deformer, self.layout, crop, deform=deform)
+        source = read_source(
+            self.deformer, self.layout, crop, deform=deform, all_seen=self.networks.all_seen
+        )
         used = self._used(source)
         return Avatar(
             self.describe(source),

@@ -127,7 +127,12 @@ def driven_points(
 
 
 def read_source(
-    deformer: DeformationModel, layout: PointLayout, head: HeadCrop, *, deform: bool = True
+    deformer: DeformationModel,
+    layout: PointLayout,
+    head: HeadCrop,
+    *,
+    deform: bool = True,
+    all_seen: bool = False,
 ) -> Source:
     """Fit hair and shoulders to the crop and find what it shows.
 
@@ -136,6 +141,7 @@ def read_source(
         layout: point numbering of the same head model.
         head: the crop.
         deform: False leaves the head bald: the ablation without deformation.
+        all_seen: True takes every point as seen: the ablation with pixel-aligned features alone.
     """
     model = deformer.head
     if deform:
@@ -144,6 +150,9 @@ def read_source(
     else:
         deformation = Deformation.none(model)
     projected = driven_points(model, layout, head.coefficients, deformation, head.camera)
-    mask = eroded(head.mask, 1)
-    visible = visible_points(layout, model.faces, projected, mask, head.camera.scale)
+    if all_seen:
+        visible = np.ones(len(projected), np.bool_)
+    else:
+        mask = eroded(head.mask, 1)
+        visible = visible_points(layout, model.faces, projected, mask, head.camera.scale)
     return Source(head, deformation, projected, visible, on_person(projected, head.mask))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,7 @@ from cvthead.cache import AvatarCache
 from cvthead.coefficients import Coefficients
 from cvthead.errors import AvatarFileError, CoefficientsError, ModelChangedError, NoFaceError
 from cvthead.images import read_image
+from cvthead.runtime.model_folder import RECORD, packaged
 
 PORTRAIT = Path(__file__).parents[1] / "examples" / "astronaut.png"
 TURN = 0.35  # radians
@@ -209,3 +212,18 @@ def test_alpha_and_background(pipeline: Pipeline, avatar: AvatarType) -> None:
     assert np.array_equal(red[frame.alpha == 255], frame.rgb[frame.alpha == 255])
     assert frame.rgba().shape == (256, 256, 4)
     assert pipeline.background(avatar).shape == (256, 256, 3)
+
+
+def test_a_model_of_pixel_aligned_features_takes_every_point_as_seen(
+    avatar: AvatarType, portrait: NDArray[np.uint8], tmp_path: Path
+) -> None:
+    """The ablation, told by what the export of a run writes into the model's record."""
+    folder = tmp_path / "model"
+    shutil.copytree(packaged("open"), folder)
+    record = json.loads((folder / RECORD).read_text())
+    record["training"]["features"] = "pixel-aligned"
+    (folder / RECORD).write_text(json.dumps(record))
+    ablation = Pipeline.load(model=folder).encode(portrait)
+    assert (ablation.places[:, 2] == 1).all()
+    assert {0, 1} < set(avatar.places[:, 2].tolist())
+    assert np.array_equal(ablation.places[:, :2], avatar.places[:, :2])

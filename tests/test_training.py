@@ -162,6 +162,23 @@ def test_the_paper_draws_what_the_portrait_cuts_off(
     assert torch.equal(whole[~away], cut[~away])
 
 
+def test_pixel_aligned_features_alone_know_of_nothing_hidden(
+    folder: Path, head: HeadModel, layout: PointLayout
+) -> None:
+    fused, alone = (
+        PairDataset(folder, head, layout, size=128, seed=1, samples=4, all_seen=all_seen)[0]
+        for all_seen in (False, True)
+    )
+    surface = slice(0, layout.surface)
+    assert np.unique(fused["seen"][:, surface]).tolist() == [0, 0.5, 1]
+    assert (alone["seen"][:, surface] == 1).all()
+    assert not torch.equal(fused["warped"], alone["warped"])
+    # What is compared, and how heavily, stays the same.
+    assert float(fused["weight"].max()) > 1
+    for name in ("source", "image", "mask", "valid", "weight", "driven"):
+        assert torch.equal(fused[name], alone[name])
+
+
 def test_the_mirror_image_of_a_still_carries_no_hair_across_the_face(
     folder: Path, head: HeadModel, layout: PointLayout
 ) -> None:

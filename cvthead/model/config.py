@@ -30,7 +30,8 @@ class ModelConfig:
         unet_unshuffle: splat and U-Net work at 1/unet_unshuffle of the image size.
         features: what the open preset's descriptors are made of; the other two are ablations:
             "pixel-aligned" samples the encoder's U-Net at every point's projection, seen or not,
-            as S3F does, and has no transformer; "transformer" has no pixel-aligned features, nor
+            as S3F does, carries the portrait to every point in the same way, and has no
+            transformer; "transformer" has no pixel-aligned features, nor
             the warped portrait, as in the paper.
     """
 

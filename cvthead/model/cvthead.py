@@ -75,7 +75,6 @@ class CVTHead(nn.Module):
         if self.config.features == "pixel-aligned":
             size = self.config.upsampler_sizes[-1]
             vertex = points.new_zeros(len(points), self.fusion.vertex_embedding.shape[0], size)
-            visible = torch.ones_like(visible)
         else:
             query = self.vertex_query + vertex_code(points[:, self.coarse], self.config.token_size)
             x = torch.cat([query, tokens.float() + self.image_code], dim=1)

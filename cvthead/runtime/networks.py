@@ -33,6 +33,7 @@ class Networks:
         splat_size: height and width of the splat, half of the frame's.
         fingerprint: of the trained weights.
         preset: of the model.
+        all_seen: see cvthead.source.read_source.
     """
 
     describe_session: ort.InferenceSession
@@ -41,6 +42,7 @@ class Networks:
     splat_size: int
     fingerprint: str
     preset: str
+    all_seen: bool
 
     @classmethod
     def load(
@@ -70,7 +72,8 @@ class Networks:
         )
         _, size, _, channels = paint.get_inputs()[0].shape
         descriptors = channels - code_size(0)
-        return cls(describe, paint, descriptors, size, folder.fingerprint, folder.preset)
+        all_seen = folder.training.get("features") == "pixel-aligned"
+        return cls(describe, paint, descriptors, size, folder.fingerprint, folder.preset, all_seen)
 
     def describe(self, source: Source) -> NDArray[np.uint8]:
         """(P, C) descriptor codes of all points of the layout."""

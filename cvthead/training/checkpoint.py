@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -37,6 +38,7 @@ class RunState:
         discriminator, discriminator_optimiser: in stage 2.
         step: steps done.
         running: smoothed losses of this process's batches.
+        best: lowest ST-LPIPS on the validation records so far.
     """
 
     model: nn.Module
@@ -46,6 +48,7 @@ class RunState:
     discriminator_optimiser: Optimizer | None
     step: int = 0
     running: dict[str, float] = field(default_factory=dict)
+    best: float = math.inf
 
     def parts(self) -> dict[str, Any]:
         """By name, those with a state_dict."""
@@ -70,6 +73,7 @@ def save(path: Path, fabric: Fabric, config: TrainConfig, state: RunState) -> No
         contents |= {
             "step": state.step,
             "running": state.running,
+            "best": state.best,
             "config": config.fixed(),
         }
         temporary = path.with_suffix(".tmp")
@@ -111,6 +115,7 @@ def resume(path: Path, fabric: Fabric, config: TrainConfig, state: RunState) -> 
     for name, part in state.parts().items():
         part.load_state_dict(contents[name])
     state.step, state.running = contents["step"], contents["running"]
+    state.best = contents.get("best", math.inf)  # absent from checkpoints of earlier versions
 
 
 def start_from(config: TrainConfig, state: RunState) -> None:

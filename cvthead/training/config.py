@@ -19,7 +19,9 @@ from cvthead.official.manifest import Manifest, default_folder
 ST_LPIPS = "st-lpips-alex"
 SHIPPED, IMPORTED = "shipped", "imported"  # weights to start from
 # What may change between two sittings of one run without changing its result.
-FREE = frozenset({"data", "model", "run", "init", "workers", "log_every", "save_every"})
+FREE = frozenset(
+    {"data", "validation", "model", "run", "init", "workers", "log_every", "save_every"}
+)
 
 
 class Section(BaseModel):
@@ -84,6 +86,8 @@ class TrainConfig(Section):
         augmentation: False leaves the pictures as they are, to learn few of them by heart;
             "official" never changes them.
         data: folder of records, such as the ``train`` folder of ``cvthead data prepare``.
+        validation: folder of records of other people, such as the ``val`` folder; at every
+            checkpoint the averaged weights are measured on it, and the best are kept.
         labels: CSV table (file, group) of the stills in ``data``, of which every group is then seen
             alike.
         run: folder of checkpoint and logs.
@@ -108,6 +112,7 @@ class TrainConfig(Section):
     deformation: bool = True
     augmentation: bool = True
     data: Path = Path("records")
+    validation: Path | None = None
     labels: Path | None = None
     run: Path = Path("run")
     init: str | None = None

@@ -31,6 +31,7 @@ from cvthead.source import (
     places,
     portrait_pixels,
 )
+from cvthead.training.augmentation import UNCHANGED, colour_jitter, degraded, jittered
 from cvthead.training.details import ZOOMED, detail_weights, unseen_weights, zoom_corner
 from cvthead.training.records import Frame, open_records
 from cvthead.training.sampling import group_shares, turned_still
@@ -41,8 +42,6 @@ Array = NDArray[np.float32]
 VIEWS = 2
 CLIP_SHARE = 0.6
 CANDIDATES = 3  # frames drawn per view of a clip; the one that differs most from the source stays
-ZOOM, SHIFT = 0.07, 0.04  # jitter of the source crop, relative to its size
-STRONG_COLOUR_SHARE = 0.4
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +72,7 @@ class PairDataset(Dataset[dict[str, Tensor]]):
         seed: int,
         samples: int,
         deform: bool = True,
+        all_seen: bool = False,
         augment: bool = True,
         labels: Path | None = None,
         whole: bool = False,
@@ -82,7 +82,9 @@ class PairDataset(Dataset[dict[str, Tensor]]):
         size: of the driven views, pixels.
         samples: length.
         deform: False leaves the heads bald: the ablation without deformation.
-        augment: False takes pictures as they are, neither mirrored nor recoloured nor zoomed.
+        all_seen: True takes every point as seen by the source, as cvthead.source.read_source.
+        augment: False takes pictures as they are, neither mirrored nor as
+            cvthead.training.augmentation changes them.
         labels: table of the stills' groups, see cvthead.training.sampling.
         whole: True draws the points that the portrait cuts off as well, as the paper does.
 
@@ -91,6 +93,7 @@ class PairDataset(Dataset[dict[str, Tensor]]):
                 labels.
         """
         self.deform, self.augment, self.whole = deform, augment, whole
+        self.all_seen = all_seen
         self.head, self.layout = head, layout
         self.size, self.seed, self.samples = size, seed, samples
         stored = open_records(folder)
@@ -139,6 +142,8 @@ class PairDataset(Dataset[dict[str, Tensor]]):
         image = np.round(
             np.clip(colours(image.astype(np.float32) / np.float32(255)), 0, 1) * 255
         ).astype(np.uint8)
+        if self.augment:
+            image = degraded(rng, image)
         views = [replace(v, image=np.clip(colours(v.image), 0, 1)) for v in views]
         network = network_input(image, mask)
         visible *= inside_mask(own, mask)
@@ -153,11 +158,22 @@ class PairDataset(Dataset[dict[str, Tensor]]):
             drawn = np.ones_like(drawn)
         driven = [np.where(drawn[:, None], v.points, FAR_AWAY) for v in views]
         landmarks = [self.head.landmarks(v.points[: self.layout.vertices]) for v in views]
-        at = places(self.layout, own, visible > 0)
         portrait = portrait_pixels(network)
         zoomed = int(rng.integers(len(ZOOMED)))
-        ats = [at if v.carries_shell else without_shell(at, self.layout) for v in views]
-        placed = [self._placed(each, its, portrait) for each, its in zip(driven, ats, strict=True)]
+
+        def carried() -> tuple[list[Array], list[Placed]]:
+            at = places(self.layout, own, visible > 0)
+            ats = [at if v.carries_shell else without_shell(at, self.layout) for v in views]
+            return ats, [self._placed(d, its, portrait) for d, its in zip(driven, ats, strict=True)]
+
+        ats, placed = carried()
+        weights = [
+            np.maximum(detail_weights(marks, self.size), unseen_weights(each))[None]
+            for marks, each in zip(landmarks, placed, strict=True)
+        ]
+        if self.all_seen:
+            visible = np.ones_like(visible)
+            ats, placed = carried()
         stack: dict[str, NDArray[Any]] = {
             "source": network,
             "points": own,
@@ -166,12 +182,7 @@ class PairDataset(Dataset[dict[str, Tensor]]):
             "anchor": anchor,
             "window": rng.random(3),
             "zoom": np.array([zoom_corner(each, zoomed, self.size) for each in landmarks]),
-            "weight": np.stack(
-                [
-                    np.maximum(detail_weights(marks, self.size), unseen_weights(each))[None]
-                    for marks, each in zip(landmarks, placed, strict=True)
-                ]
-            ),
+            "weight": np.stack(weights),
             "background": np.full((VIEWS, 3, 1, 1), 1, np.float32) * rng.random((1, 3, 1, 1)),
             "driven": np.stack(driven),
             "warped": np.stack([as_network_input(each.warped) for each in placed]),
@@ -244,52 +255,3 @@ def mirrored(view: View, layout: PointLayout) -> View:
         flip_points(view.points, layout),
         view.carries_shell,
     )
-
-
-def jittered(
-    rng: np.random.Generator, source: Frame, points: Array
-) -> tuple[NDArray[np.uint8], Array, Array]:
-    """The source crop slightly zoomed and shifted: image, mask and points."""
-    size = source.image.shape[0]
-    zoom = float(rng.uniform(1 - ZOOM, 1 + ZOOM))
-    shift = rng.uniform(-SHIFT, SHIFT, 2)
-    centre = (size - 1) / 2
-    offset = centre - zoom * centre + shift * size / 2
-    matrix = np.array([[zoom, 0, offset[0]], [0, zoom, offset[1]]])
-    image = cv2.warpAffine(source.image, matrix, (size, size), borderMode=cv2.BORDER_REPLICATE)
-    mask = cv2.warpAffine(source.mask, matrix, (size, size))
-    moved = points * np.float32(zoom)
-    moved[:, :2] += shift.astype(np.float32)
-    return image.astype(np.uint8), mask.astype(np.float32), moved
-
-
-@dataclass(frozen=True)
-class ColourJitter:
-    """Affine change of colour: ``image @ matrix + offset``, clipped to 0..1."""
-
-    matrix: Array
-    offset: float
-
-    def __call__(self, image: Array) -> Array:
-        return np.asarray(np.clip(image @ self.matrix + np.float32(self.offset), 0, 1), np.float32)
-
-
-UNCHANGED = ColourJitter(np.eye(3, dtype=np.float32), 0.0)
-
-
-def colour_jitter(rng: np.random.Generator) -> ColourJitter:
-    """One change of light, saturation and hue for all images of a sample.
-
-    A part of the samples gets any hue at all: colours must be copied, not guessed from what
-    people and clothes usually look like.
-    """
-    strong = rng.random() < STRONG_COLOUR_SHARE
-    hue = rng.uniform(-np.pi, np.pi) if strong else rng.normal(0, 0.05)
-    gain = rng.uniform(0.8, 1.15) * rng.uniform(0.94, 1.06, 3)
-    # Rodrigues' rotation of RGB about the grey axis.
-    axis = np.full(3, 3**-0.5)
-    turn = cv2.Rodrigues(axis * hue)[0]
-    grey = np.full((3, 3), 1 / 3)
-    saturation = rng.uniform(0.75, 1.2)
-    matrix = (grey + (np.eye(3) - grey) * saturation) @ turn * gain
-    return ColourJitter(matrix.astype(np.float32), float(rng.uniform(-0.04, 0.06)))

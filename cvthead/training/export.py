@@ -86,13 +86,20 @@ def forget_portrait(model: CVTHead) -> None:
 
 
 def samples(
-    records: Path, count: int, *, deform: bool
+    records: Path, count: int, *, deform: bool, all_seen: bool
 ) -> tuple[PointLayout, list[dict[str, NDArray[Any]]]]:
     """Training samples to calibrate on."""
     head = HeadModel.load()
     layout = PointLayout.of(head)
     dataset = PairDataset(
-        records, head, layout, size=CROP_PIXELS, seed=SEED, samples=count, deform=deform
+        records,
+        head,
+        layout,
+        size=CROP_PIXELS,
+        seed=SEED,
+        samples=count,
+        deform=deform,
+        all_seen=all_seen,
     )
     batches = (dataset[index] for index in range(count))
     return layout, [{name: value.numpy() for name, value in b.items()} for b in batches]
@@ -168,7 +175,12 @@ def export(
     # The networks are made of the weights as stored, in half precision.
     fingerprint = weights.load_into(model, output / WEIGHTS)
     model.eval().requires_grad_(False)
-    layout, calibration = samples(records, CALIBRATION + HELD_OUT, deform=deform)
+    layout, calibration = samples(
+        records,
+        CALIBRATION + HELD_OUT,
+        deform=deform,
+        all_seen=model.config.features == "pixel-aligned",
+    )
     largest = descriptor_range(model, calibration[:CALIBRATION])
     export_describe(model, largest, output / DESCRIBE)
     placed = frames(output / DESCRIBE, layout, calibration)

@@ -10,6 +10,7 @@ from cvthead.training.details import ZOOM_SIDE
 
 WINDOW = 0.75  # side, as a share of the view's
 ZOOM_SHARE = 0.4  # of the steps, whose perceptual loss sees enlarged eyes or mouths
+TRUE_MASK_SHARE = 0.3  # of the steps, whose perceptual loss sees the colours under the true mask
 
 
 def window(place: Tensor, size: int) -> tuple[slice, slice]:
@@ -48,7 +49,7 @@ def reconstruction_losses(
         rgb: (b, 3, s, s) in [-1, 1]; logits: (b, 1, s, s) of the mask.
         batch: image (b, 3, s, s) in 0..1, mask and valid (b, 1, s, s), background (b, 3, 1, 1),
             weight (b, 1, s, s) of each pixel; zoom (b, 2), see :func:`zoomed`; window (b, 3) in
-            0..1: the first decides for all where the perceptual loss looks.
+            0..1: the first decides for all where the perceptual loss looks, and by which mask.
         perceptual: frozen distance network, (b, 3, h, w) twice -> (b,).
 
     Returns:
@@ -64,8 +65,8 @@ def reconstruction_losses(
     weight = valid * batch["weight"]
     area = (weight.sum() * 3).clamp(min=1)
     l1 = (((painted - target).abs() + 0.5 * (own - target).abs()) * weight).sum() / area
-    shown = own * valid + target * (1 - valid)
     place, kind = batch["window"][0, :2], batch["window"][0, 2]
+    shown = (painted if kind > 1 - TRUE_MASK_SHARE else own) * valid + target * (1 - valid)
     if kind < ZOOM_SHARE:
         shown, compared = (zoomed(image, batch["zoom"]) for image in (shown, target))
     else:

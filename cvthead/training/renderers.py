@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 from einops import rearrange, repeat
 from torch import Tensor, nn
@@ -20,6 +21,8 @@ from cvthead.training.dataset import VIEWS, PairDataset
 from cvthead.training.official_dataset import OfficialPairDataset
 
 Batch = dict[str, Tensor]
+
+VALIDATION_SAMPLES = 32
 
 
 class OpenRenderer(nn.Module):
@@ -72,30 +75,46 @@ def training_parts(config: TrainConfig) -> tuple[Samples, Renderer]:
         InputError: no records, or those of another preset; no table of labels.
         AssetError: preset official, and nothing was imported.
     """
-    common = {
-        "size": config.size,
-        "seed": config.seed + config.size,
-        "samples": config.steps * config.batch,
-    }
+    samples = _samples(
+        config, config.data, samples=config.steps * config.batch, augment=config.augmentation
+    )
+    if isinstance(samples, OfficialPairDataset):
+        return samples, paper_renderer(config.features, samples.tables.hierarchy)
+    hierarchy = MeshHierarchy.load()
+    if config.preset == "paper":
+        return samples, paper_renderer(config.features, hierarchy)
+    network = replace(OPEN, features=config.features)
+    return samples, OpenRenderer(CVTHead(network, hierarchy, samples.layout))
+
+
+def validation_samples(config: TrainConfig) -> Samples:
+    """Samples of ``config.validation``, the same for every run.
+
+    Raises:
+        InputError, AssetError: as :func:`training_parts`.
+    """
+    assert config.validation is not None
+    alike = config.model_copy(update={"seed": 0, "labels": None})
+    return _samples(alike, config.validation, samples=VALIDATION_SAMPLES, augment=False)
+
+
+def _samples(config: TrainConfig, data: Path, *, samples: int, augment: bool) -> Samples:
+    common = {"size": config.size, "seed": config.seed + config.size, "samples": samples}
     if config.preset == "official":
         tables = OfficialTables.load(config.imported)
-        samples = OfficialPairDataset(config.data, tables, deform=config.deformation, **common)
-        return samples, paper_renderer(config.features, tables.hierarchy)
-    head, hierarchy = HeadModel.load(), MeshHierarchy.load()
-    layout = PointLayout.of(head)
-    pairs = PairDataset(
-        config.data,
+        return OfficialPairDataset(data, tables, deform=config.deformation, **common)
+    head = HeadModel.load()
+    return PairDataset(
+        data,
         head,
-        layout,
+        PointLayout.of(head),
         deform=config.deformation,
+        all_seen=config.preset == "open" and config.features == "pixel-aligned",
         labels=config.labels,
-        augment=config.augmentation,
+        augment=augment,
         whole=config.preset == "paper",
         **common,
     )
-    if config.preset == "paper":
-        return pairs, paper_renderer(config.features, hierarchy)
-    return pairs, OpenRenderer(CVTHead(replace(OPEN, features=config.features), hierarchy, layout))
 
 
 def paper_renderer(features: Features, hierarchy: MeshHierarchy) -> PaperRenderer:

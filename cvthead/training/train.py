@@ -1,6 +1,7 @@
 """The training loop: one process, or many under ``torchrun``.
 
-A run is a folder with ``checkpoint.pt`` (continued from when present), ``config.json``,
+A run is a folder with ``checkpoint.pt`` (continued from when present), ``best.pt`` (the checkpoint
+that was best on people it does not learn from, where such are given), ``config.json``,
 ``log.jsonl``, ``tensorboard/`` and ``samples.png``. The samples and random numbers of a step depend
 on the seed and the step alone, and the processes share each step's batch, so that neither a break
 nor their number changes what is trained on.
@@ -34,8 +35,10 @@ from cvthead.training.losses import compared_views
 from cvthead.training.objective import Objective
 from cvthead.training.renderers import Batch, Samples, training_parts
 from cvthead.training.schedule import averaging, freeze_norms, learning_rate
+from cvthead.training.validation import CHOSEN_BY, Validation
 
 SMOOTHING = 0.98  # of the logged losses, per step
+BEST = "best.pt"
 PER_VIEW = ("image", "mask", "valid", "background", "weight", "zoom")
 
 
@@ -50,8 +53,8 @@ def train(config: TrainConfig, *, sitting: int | None = None) -> Path:
         The checkpoint.
 
     Raises:
-        InputError: no records, missing weights, a batch that the processes cannot share, or a
-            run folder of other settings.
+        InputError: no records, to learn from or to validate on, missing weights, a batch that the
+            processes cannot share, or a run folder of other settings.
         AssetError: preset official, and nothing was imported.
     """
     fabric = launched(config)
@@ -66,6 +69,7 @@ def train(config: TrainConfig, *, sitting: int | None = None) -> Path:
     if discriminator is not None:
         plain = new_optimiser(config, discriminator)
         judge, judge_optimiser = fabric.setup(discriminator, plain)
+    validation = Validation(fabric, config) if config.validation is not None else None
     state = RunState(
         renderer.model,
         AveragedModel(renderer.model, multi_avg_fn=averaging(config.average), use_buffers=True),
@@ -121,6 +125,14 @@ def train(config: TrainConfig, *, sitting: int | None = None) -> Path:
                 seconds = (time.monotonic() - started) / (state.step - first)
                 log.write(state.step, {"seconds_per_step": seconds} | state.running)
         if state.step % config.save_every == 0 or state.step == last:
+            if validation is not None:
+                mine = validation(renderer, state.averaged.module) if log is not None else {}
+                found = fabric.broadcast(mine)  # or the processes might decide differently
+                if log is not None:
+                    log.write(state.step, found)
+                if found[CHOSEN_BY] < state.best:
+                    state.best = found[CHOSEN_BY]
+                    save(config.run / BEST, fabric, config, state)
             save(checkpoint, fabric, config, state)
             if log is not None:
                 grid = sample_grid(batch, rgb, logits)
