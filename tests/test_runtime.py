@@ -18,7 +18,9 @@ from cvthead.errors import AssetError
 from cvthead.images import read_image
 from cvthead.model import splat as torch_splat
 from cvthead.model.fill import fill as torch_fill
+from cvthead.model.light_unet import even as torch_even
 from cvthead.runtime.fill import FILL_LEVELS, ZERO, fill
+from cvthead.runtime.mix import evened
 from cvthead.runtime.model_folder import PAINT, RECORD, ModelFolder, packaged
 from cvthead.runtime.networks import Networks
 from cvthead.runtime.splat import EMPTY_DEPTH, splat
@@ -75,6 +77,23 @@ def test_fill_is_the_one_the_network_was_trained_with() -> None:
     )
     for level, share in enumerate(shares):
         assert np.abs(coverage[..., level] / 255 - share[0, 0].numpy()).max() < 0.005
+
+
+def test_painted_pixels_are_evened_as_the_network_was_trained() -> None:
+    codes = np.random.default_rng(3).integers(60, 200, (32, 32, 4)).astype(np.uint8)
+    image = torch.from_numpy(codes).permute(2, 0, 1)[None].float()
+    expected = torch_even(image)[0].permute(1, 2, 0).numpy()
+    assert np.abs(evened(codes).astype(np.float32) - expected.clip(0, 255)).max() <= 0.51
+
+
+def test_evening_passes_no_single_pixels_and_leaves_what_is_coarse() -> None:
+    row, column = np.indices((32, 32))
+    for finest in (row % 2, column % 2, (row + column) % 2):
+        assert np.ptp(evened((100 + 80 * finest).astype(np.uint8))[2:-2, 2:-2]) == 0
+    assert (evened(np.full((32, 32), 77, np.uint8)) == 77).all()
+    wave = 128 + 80 * np.sin(2 * np.pi * row / 8)
+    left = np.ptp(evened(wave.astype(np.uint8))[4:-4]) / np.ptp(wave)
+    assert left > 0.95  # a filter of 1/4, 1/2, 1/4 leaves .85
 
 
 def test_subpixels_are_put_back() -> None:

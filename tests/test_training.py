@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from lightning_fabric import Fabric
 from made_records import make_records, portrait_crop
 
 from cvthead.cli.main import main
@@ -28,7 +29,7 @@ from cvthead.training.config import TrainConfig, load_config, merged, setting
 from cvthead.training.dataset import PairDataset, flip_order, flip_points
 from cvthead.training.perceptual import perceptual_weights
 from cvthead.training.renderers import OpenRenderer
-from cvthead.training.train import train
+from cvthead.training.train import autocast, train
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -132,6 +133,20 @@ def test_half_precision_leaves_the_points_where_they_are(
     values = small(folder, tmp_path / "run", steps=1, precision="bf16-mixed")
     train(TrainConfig.model_validate(values))
     assert kinds == [{torch.float32}]
+
+
+@pytest.mark.parametrize(
+    ("precision", "capable", "half"),
+    [("auto", True, True), ("auto", False, False), ("32-true", True, False)],
+)
+def test_half_precision_is_for_processors_that_compute_in_it(
+    precision: str, capable: bool, half: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": capable})
+    config = TrainConfig.model_validate({"steps": 1, "precision": precision})
+    with autocast(Fabric(accelerator="cpu"), config):
+        product = torch.ones(2, 2) @ torch.ones(2, 2)
+    assert product.dtype == (torch.bfloat16 if half else torch.float32)
 
 
 def test_without_deformation_no_shell_is_drawn(

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from cvthead.model.layers import conv_bn_relu, upsample
+from cvthead.runtime.mix import EVEN
 
 PIXEL_SIZE = 8  # channels at full resolution
 PORTRAIT_SIZE = 4  # RGB and mask
@@ -30,12 +31,14 @@ def clipped(colour: Tensor) -> Tensor:
 
 
 def even(image: Tensor) -> Tensor:
-    """Blur by 1/4, 1/2, 1/4 both ways: pixels come in blocks of two by two, and no loss keeps the
-    four from drifting apart, which shows as dots. This filter passes nothing of that pattern."""
+    """Filter by EVEN both ways: pixels come in blocks of two by two, and no loss keeps the four
+    from drifting apart, which shows as dots. This filter passes nothing of that pattern, and of
+    what is coarser than three pixels nearly everything."""
     channels = image.shape[1]
-    line = torch.tensor([0.25, 0.5, 0.25], device=image.device)
-    kernel = torch.outer(line, line).expand(channels, 1, 3, 3)
-    return F.conv2d(F.pad(image, (1, 1, 1, 1), "reflect"), kernel, groups=channels)
+    line = torch.tensor(EVEN, device=image.device)
+    kernel = torch.outer(line, line).expand(channels, 1, -1, -1)
+    edge = len(EVEN) // 2
+    return F.conv2d(F.pad(image, (edge,) * 4, "reflect"), kernel, groups=channels)
 
 
 class LightUNet(nn.Module):

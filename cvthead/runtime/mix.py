@@ -16,6 +16,9 @@ LOGIT_RANGE = 8.0
 SIGMOID = np.reciprocal(1 + np.exp(LOGIT_RANGE * (1 - np.arange(256) / 127.5)))
 ALPHA = np.rint(255 * SIGMOID).astype(np.uint8)
 GATE = SIGMOID.astype(np.float32)
+# Symmetric filter: 0 at the finest pattern that pixels can show, flat at coarse ones.
+EVEN = (-1 / 16, 4 / 16, 10 / 16, 4 / 16, -1 / 16)
+LINE = np.array(EVEN, np.float32)
 
 
 def mix(codes: Codes, warped: Codes, reach: Codes) -> Codes:
@@ -32,15 +35,15 @@ def mix(codes: Codes, warped: Codes, reach: Codes) -> Codes:
     """
     fours = codes.view(np.uint32)  # a block's four pixels, then its four gates
     pixels = shuffled(np.ascontiguousarray(fours[..., :GATES]))
-    painted = _even(pixels.view(np.uint8).reshape(warped.shape))
+    painted = evened(pixels.view(np.uint8).reshape(warped.shape))
     gates = shuffled(np.ascontiguousarray(fours[..., GATES:]).view(np.uint8))
-    gate = cv2.LUT(_even(gates), GATE)
+    gate = cv2.LUT(evened(gates), GATE)
     out = cv2.blendLinear(warped, painted, gate, 1 - gate)
     alpha = cv2.min(cv2.LUT(cv2.extractChannel(painted, 3), ALPHA), reach)
     cv2.insertChannel(alpha, out, 3)
     return np.asarray(out, np.uint8)
 
 
-def _even(image: NDArray[np.generic]) -> Codes:
-    """Blur by 1/4, 1/2, 1/4 both ways, as cvthead.model.light_unet.even does."""
-    return np.asarray(cv2.GaussianBlur(image, (3, 3), 0), np.uint8)  # type: ignore[arg-type]
+def evened(image: NDArray[np.generic]) -> Codes:
+    """(s, s) or (s, s, C), filtered as cvthead.model.light_unet.even does."""
+    return np.asarray(cv2.sepFilter2D(image, -1, LINE, LINE), np.uint8)  # type: ignore[call-overload]

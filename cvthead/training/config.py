@@ -97,7 +97,8 @@ class TrainConfig(Section):
         steps: length of the run.
         batch: sources per step over all processes.
         stage: 2 adds the adversarial terms, as the released code's second stage does.
-        precision: "bf16-mixed" or "32-true".
+        precision: "bf16-mixed", "32-true", or "auto": the former where the processor computes
+            in bfloat16. Elsewhere it emulates that, ten times slower than float32.
         freeze_norm: share of the steps after which batch-norm statistics stay fixed, so that the
             network is trained as it will be run; 1 never.
         average: decay of the averaged weights that are exported.
@@ -120,7 +121,7 @@ class TrainConfig(Section):
     steps: int = Field(ge=1)
     batch: int = Field(default=16, ge=1)
     stage: Literal[1, 2] = 1
-    precision: Literal["bf16-mixed", "32-true"] = "bf16-mixed"
+    precision: Literal["auto", "bf16-mixed", "32-true"] = "auto"
     freeze_norm: float = Field(default=1.0, ge=0, le=1)
     average: float = Field(default=0.0, ge=0, lt=1)
     seed: int = Field(default=0, ge=0)

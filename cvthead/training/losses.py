@@ -9,8 +9,8 @@ from torch.nn import functional as F
 from cvthead.training.details import ZOOM_SIDE
 
 WINDOW = 0.75  # side, as a share of the view's
-ZOOM_SHARE = 0.4  # of the steps, whose perceptual loss sees enlarged eyes or mouths
-TRUE_MASK_SHARE = 0.3  # of the steps, whose perceptual loss sees the colours under the true mask
+ZOOM_SHARE = 0.3  # of the steps, whose perceptual loss sees enlarged eyes or mouths
+TRUE_MASK_SHARE = 0.45  # of the steps, whose perceptual loss sees the colours under the true mask
 
 
 def window(place: Tensor, size: int) -> tuple[slice, slice]:

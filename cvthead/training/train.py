@@ -39,6 +39,7 @@ from cvthead.training.validation import CHOSEN_BY, Validation
 
 SMOOTHING = 0.98  # of the logged losses, per step
 BEST = "best.pt"
+BFLOAT16 = ("avx512_bf16", "amx_bf16", "bf16")  # as x86 and ARM name it
 PER_VIEW = ("image", "mask", "valid", "background", "weight", "zoom")
 
 
@@ -174,8 +175,18 @@ def autocast(fabric: Fabric, config: TrainConfig) -> torch.autocast:
     Fabric's own would round their inputs as well, and with them the points: in bfloat16 a point
     near the edge lies up to half a pixel off.
     """
-    half = config.precision == "bf16-mixed"
+    half = config.precision == "bf16-mixed" or (
+        config.precision == "auto" and computes_bfloat16(fabric.device)
+    )
     return torch.autocast(fabric.device.type, torch.bfloat16, enabled=half)
+
+
+def computes_bfloat16(device: torch.device) -> bool:
+    """Whether the device has instructions for bfloat16, rather than emulating them."""
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    capabilities = torch.cpu.get_capabilities()
+    return any(capabilities.get(name, False) for name in BFLOAT16)
 
 
 def step_seed(seed: int, step: int, rank: int) -> int:
