@@ -10,6 +10,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import onnx
 import pytest
 import torch
 
@@ -21,7 +22,14 @@ from cvthead.model.fill import fill as torch_fill
 from cvthead.model.light_unet import even as torch_even
 from cvthead.runtime.fill import FILL_LEVELS, ZERO, fill
 from cvthead.runtime.mix import evened
-from cvthead.runtime.model_folder import PAINT, RECORD, ModelFolder, packaged
+from cvthead.runtime.model_folder import (
+    DESCRIBE,
+    PAINT,
+    RECORD,
+    ModelFolder,
+    packaged,
+    write_record,
+)
 from cvthead.runtime.networks import Networks
 from cvthead.runtime.splat import EMPTY_DEPTH, splat
 from cvthead.runtime.subpixels import shuffled, unshuffled
@@ -140,6 +148,23 @@ def test_a_provider_that_is_not_installed_is_refused() -> None:
     with pytest.raises(AssetError, match="no NoSuchExecutionProvider") as caught:
         Pipeline.load(providers=("NoSuchExecutionProvider", "CPUExecutionProvider"))
     assert "CPUExecutionProvider" in str(caught.value.hint)
+
+
+def test_networks_of_another_version_are_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "model"
+    shutil.copytree(packaged("open"), folder)
+    network = onnx.load(str(folder / DESCRIBE))
+    for given in network.graph.input:
+        if given.name == "nearby":
+            given.name = "unknown"
+    for node in network.graph.node:
+        node.input[:] = ["unknown" if name == "nearby" else name for name in node.input]
+    onnx.save(network, str(folder / DESCRIBE))
+    before = ModelFolder.load(folder)
+    write_record(folder, before.preset, before.fingerprint, before.training)
+    with pytest.raises(AssetError, match="another version") as caught:
+        Networks.load(folder)
+    assert "export" in str(caught.value.hint)
 
 
 def test_altered_or_missing_files_are_refused(tmp_path: Path) -> None:

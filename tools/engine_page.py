@@ -28,6 +28,7 @@ from cvthead.head.hierarchy import MeshHierarchy
 from cvthead.images import read_image
 from cvthead.model.config import OPEN
 from cvthead.model.cvthead import CVTHead
+from cvthead.nearby import nearby_colours
 from cvthead.pipeline import Pipeline
 from cvthead.points import FAR_AWAY
 from cvthead.runtime.model_folder import WEIGHTS, packaged
@@ -70,11 +71,11 @@ class FloatNetwork:
         anchor = np.zeros(MAX_SHELL_POINTS, np.int64)
         anchor[: len(source.deformation.shell_anchor)] = source.deformation.shell_anchor
         visible = source.visible.astype(np.float32)
-        image, points, seen, anchors = (
-            torch.from_numpy(x)[None]
-            for x in (source.network_input, source.points, visible, anchor)
+        nearby = nearby_colours(
+            self.pipeline.layout, source.network_input, source.points, source.visible
         )
-        return self.model.describe(image, points, seen, anchors)
+        inputs = (source.network_input, source.points, visible, anchor, nearby)
+        return self.model.describe(*(torch.from_numpy(x)[None] for x in inputs))
 
     def paint(
         self, avatar: Avatar, source: Source, descriptors: Tensor, points: NDArray[np.float32]

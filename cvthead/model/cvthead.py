@@ -59,7 +59,9 @@ class CVTHead(nn.Module):
         size_in = 1 + config.descriptor_size + 1 + FILL_LEVELS
         self.unet = LightUNet(size_in, config.unet_sizes, config.unet_unshuffle)
 
-    def describe(self, source: Tensor, points: Tensor, visible: Tensor, anchor: Tensor) -> Tensor:
+    def describe(
+        self, source: Tensor, points: Tensor, visible: Tensor, anchor: Tensor, nearby: Tensor
+    ) -> Tensor:
         """Point descriptors of a source image (paper section 3.3).
 
         Args:
@@ -67,6 +69,7 @@ class CVTHead(nn.Module):
             points: (b, p, 3) normalised source projections: vertices, midpoints, shell.
             visible: (b, p) 1 where the source sees the point.
             anchor: (b, shell) vertex that each shell point hangs on.
+            nearby: (b, p, 3) of cvthead.nearby.
 
         Returns:
             (b, p, C) float32.
@@ -81,7 +84,7 @@ class CVTHead(nn.Module):
             x = self.transformer(x)[:, : len(self.coarse)]
             vertex = self.upsampler(x)  # b n f
             if self.config.features == "transformer":
-                visible = torch.zeros_like(visible)
+                visible, nearby = torch.zeros_like(visible), torch.zeros_like(nearby)
         embedding = self.fusion.vertex_embedding.expand(len(source), -1, -1)
         feature = self._spread(vertex, anchor)
         embedding = self._spread(embedding, anchor)
@@ -89,7 +92,7 @@ class CVTHead(nn.Module):
         shell = torch.arange(len(self.mirror), points.shape[1], device=self.mirror.device)
         mirror = torch.cat([self.mirror, shell])
         out: Tensor = self.fusion(
-            feature, embedding, pixels.float(), source, points, visible, mirror
+            feature, embedding, pixels.float(), source, points, visible, mirror, nearby
         )
         return out
 

@@ -46,4 +46,4 @@ def mix(codes: Codes, warped: Codes, reach: Codes) -> Codes:
 
 def evened(image: NDArray[np.generic]) -> Codes:
     """(s, s) or (s, s, C), filtered as cvthead.model.light_unet.even does."""
-    return np.asarray(cv2.sepFilter2D(image, -1, LINE, LINE), np.uint8)  # type: ignore[call-overload]
+    return np.asarray(cv2.sepFilter2D(image, -1, LINE, LINE), np.uint8)  # type: ignore[arg-type]

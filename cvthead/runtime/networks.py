@@ -11,6 +11,7 @@ import onnxruntime as ort
 from numpy.typing import NDArray
 
 from cvthead.deformation import MAX_SHELL_POINTS
+from cvthead.errors import AssetError
 from cvthead.runtime.mix import mix
 from cvthead.runtime.model_folder import DESCRIBE, PAINT, ModelFolder
 from cvthead.runtime.place import Placed, code_size
@@ -20,6 +21,7 @@ from cvthead.runtime.threads import cores
 from cvthead.source import Source
 
 MAX_THREADS = 4  # more bring nothing at this size
+DESCRIBE_INPUTS = ("source", "points", "visible", "anchor", "nearby")
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +64,8 @@ class Networks:
             encode_niceness: as cvthead.preset.load_preset has it.
 
         Raises:
-            AssetError: a file is missing or altered, or onnxruntime lacks a provider.
+            AssetError: a file is missing, altered, or of another version of cvthead, or
+                onnxruntime lacks a provider.
         """
         folder = ModelFolder.load(path)
         count = threads or min(MAX_THREADS, cores())
@@ -70,13 +73,23 @@ class Networks:
             open_session(folder.read(name), count, providers, niceness=niceness)
             for name, niceness in ((DESCRIBE, encode_niceness), (PAINT, 0))
         )
+        if {each.name for each in describe.get_inputs()} != set(DESCRIBE_INPUTS):
+            raise AssetError(
+                f"{path} was exported by another version of cvthead",
+                hint="export its run again with cvthead.training.export",
+            )
         _, size, _, channels = paint.get_inputs()[0].shape
         descriptors = channels - code_size(0)
         all_seen = folder.training.get("features") == "pixel-aligned"
         return cls(describe, paint, descriptors, size, folder.fingerprint, folder.preset, all_seen)
 
-    def describe(self, source: Source) -> NDArray[np.uint8]:
-        """(P, C) descriptor codes of all points of the layout."""
+    def describe(self, source: Source, nearby: NDArray[np.float32]) -> NDArray[np.uint8]:
+        """(P, C) descriptor codes of all points of the layout.
+
+        Args:
+            source: the portrait.
+            nearby: (P, 3) of cvthead.nearby.
+        """
         shell = source.deformation.shell_anchor
         anchor = np.zeros((1, MAX_SHELL_POINTS), np.int64)
         anchor[0, : len(shell)] = shell
@@ -85,6 +98,7 @@ class Networks:
             "points": source.points[None],
             "visible": source.visible[None].astype(np.float32),
             "anchor": anchor,
+            "nearby": nearby[None],
         }
         out: NDArray[np.uint8] = self.describe_session.run(None, feed)[0][0]
         return out

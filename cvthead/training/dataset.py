@@ -22,6 +22,7 @@ from cvthead.deformation import MAX_SHELL_POINTS, Deformation
 from cvthead.driving import at_neck
 from cvthead.head.model import HeadModel
 from cvthead.model.config import OPEN
+from cvthead.nearby import nearby_colours
 from cvthead.points import FAR_AWAY, PointLayout
 from cvthead.runtime.place import Placed, place
 from cvthead.source import (
@@ -171,6 +172,7 @@ class PairDataset(Dataset[dict[str, Tensor]]):
             np.maximum(detail_weights(marks, self.size), unseen_weights(each))[None]
             for marks, each in zip(landmarks, placed, strict=True)
         ]
+        nearby = nearby_colours(self.layout, network, own, visible > 0)
         if self.all_seen:
             visible = np.ones_like(visible)
             ats, placed = carried()
@@ -180,6 +182,7 @@ class PairDataset(Dataset[dict[str, Tensor]]):
             "visible": visible,
             "seen": np.stack([each[:, 2] for each in ats]),
             "anchor": anchor,
+            "nearby": nearby,
             "window": rng.random(3),
             "zoom": np.array([zoom_corner(each, zoomed, self.size) for each in landmarks]),
             "weight": np.stack(weights),

@@ -35,6 +35,7 @@ from cvthead.model.light_unet import PIXEL_SIZE, PORTRAIT_SIZE
 from cvthead.points import PointLayout
 from cvthead.runtime.mix import LOGIT_RANGE
 from cvthead.runtime.model_folder import DESCRIBE, PAINT, WEIGHTS, write_record
+from cvthead.runtime.networks import DESCRIBE_INPUTS
 from cvthead.runtime.place import Placed, place
 from cvthead.source import places, portrait_pixels
 from cvthead.training.checkpoint import averaged, read
@@ -45,7 +46,6 @@ from cvthead.training.records import records_hash
 
 CALIBRATION, HELD_OUT = 32, 16
 SPLAT_SIZE = CROP_PIXELS // OPEN.unet_unshuffle
-DESCRIBE_INPUTS = ("source", "points", "visible", "anchor")
 SEED = 2  # of the calibration samples
 NOTES = ("licence", "data")
 DESCRIPTOR_SHARE = 0.9999  # the rest is clipped to the largest code
@@ -163,6 +163,7 @@ def export(
     deform = state.get("config", {}).get("deformation", True)
     training = {
         "step": str(state["step"]),
+        "seed": str(state.get("config", {}).get("seed", "unknown")),
         "features": model.config.features,
         "deformation": str(deform).lower(),
         "records_sha256": records_hash(records),

@@ -41,9 +41,11 @@ class DescribeGraph(nn.Module):
         self.model = model
         self.register_buffer("largest", largest)
 
-    def forward(self, source: Tensor, points: Tensor, visible: Tensor, anchor: Tensor) -> Tensor:
+    def forward(
+        self, source: Tensor, points: Tensor, visible: Tensor, anchor: Tensor, nearby: Tensor
+    ) -> Tensor:
         """(b, p, C) uint8, ``largest`` (C,) of either sign on CODE_STEPS codes."""
-        descriptors = self.model.describe(source, points, visible, anchor) / self.largest
+        descriptors = self.model.describe(source, points, visible, anchor, nearby) / self.largest
         steps = (descriptors * CODE_STEPS).round().clamp(-CODE_STEPS, CODE_STEPS)
         return (steps + ZERO).to(torch.uint8)
 
@@ -151,7 +153,7 @@ def folded(model: CVTHead) -> CVTHead:
 
 
 def export_describe(model: CVTHead, largest: Tensor, path: Path) -> None:
-    """Write the source network; inputs source, points, visible, anchor of CVTHead.describe.
+    """Write the source network; inputs as CVTHead.describe has them.
 
     Raises:
         AssetError: onnxruntime and torch differ.
@@ -163,6 +165,7 @@ def export_describe(model: CVTHead, largest: Tensor, path: Path) -> None:
         "points": torch.rand(1, points, 3, generator=generator) * 2 - 1,
         "visible": (torch.rand(1, points, generator=generator) > 0.5).float(),
         "anchor": torch.randint(0, 1000, (1, MAX_SHELL_POINTS), generator=generator),
+        "nearby": torch.rand(1, points, 3, generator=generator) * 2 - 1,
     }
     export_graph(DescribeGraph(folded(model), largest), inputs, path)
     with torch.inference_mode():

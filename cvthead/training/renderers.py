@@ -16,6 +16,7 @@ from cvthead.model.paper import PaperCVTHead
 from cvthead.model.paper_pixel_aligned import PixelAlignedCVTHead
 from cvthead.official.tables import OfficialTables
 from cvthead.points import PointLayout
+from cvthead.runtime.networks import DESCRIBE_INPUTS
 from cvthead.training.config import TrainConfig
 from cvthead.training.dataset import VIEWS, PairDataset
 from cvthead.training.official_dataset import OfficialPairDataset
@@ -34,9 +35,7 @@ class OpenRenderer(nn.Module):
 
     def forward(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """RGB (b * VIEWS, 3, s, s) in [-1, 1] and mask logits (b * VIEWS, 1, s, s)."""
-        descriptors = self.model.describe(
-            batch["source"], batch["points"], batch["visible"], batch["anchor"]
-        )
+        descriptors = self.model.describe(*(batch[name] for name in DESCRIBE_INPUTS))
         return self.model.paint(
             rearrange(batch["driven"], "b v p c -> (b v) p c"),
             repeat(descriptors, "b p c -> (b v) p c", v=VIEWS),

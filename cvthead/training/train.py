@@ -184,7 +184,7 @@ def autocast(fabric: Fabric, config: TrainConfig) -> torch.autocast:
 def computes_bfloat16(device: torch.device) -> bool:
     """Whether the device has instructions for bfloat16, rather than emulating them."""
     if device.type == "cuda":
-        return torch.cuda.is_bf16_supported(including_emulation=False)
+        return bool(torch.cuda.is_bf16_supported(including_emulation=False))
     capabilities = torch.cpu.get_capabilities()
     return any(capabilities.get(name, False) for name in BFLOAT16)
 
