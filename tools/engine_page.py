@@ -95,7 +95,8 @@ class FloatNetwork:
             torch.from_numpy(source.places(layout)[None, :, 2]),
             torch.from_numpy(as_network_input(placed.warped))[None],
         )
-        colour = (rgb[0].permute(1, 2, 0) + 1) * 127.5
+        # Beside sharp edges the filter over what is painted overshoots.
+        colour = ((rgb[0].permute(1, 2, 0) + 1) * 127.5).clamp(0, 255)
         alpha = logits[0, 0].sigmoid() * 255
         pixels, mask = (x.round().to(torch.uint8).numpy() for x in (colour, alpha))
         # Beyond the points no network is asked.

@@ -36,6 +36,8 @@ def quantise_network(
     overrides: Callable[[onnx.ModelProto], Overrides] | None = None,
     operators: Sequence[str] = QUANTISED,
     first: int = 0,
+    *,
+    seven_bits: bool = False,
 ) -> onnx.ModelProto:
     """The 8-bit network, still with float inputs and outputs.
 
@@ -45,6 +47,8 @@ def quantise_network(
         overrides: the network as it is quantised -> scales that calibration must not choose.
         operators: whose inputs and outputs are rounded.
         first: the first convolution of which that is true; those before it stay in float.
+        seven_bits: of the weights. Processors without VNNI add products in 16 bits, which
+            overflow with eight: the same network gives another picture there.
     """
     with tempfile.TemporaryDirectory() as folder:
         prepared, simulated = Path(folder) / "prepared.onnx", Path(folder) / "simulated.onnx"
@@ -58,6 +62,7 @@ def quantise_network(
             op_types_to_quantize=list(operators),
             quant_format=QuantFormat.QDQ,
             per_channel=True,
+            reduce_range=seven_bits,
             activation_type=QuantType.QUInt8,
             weight_type=QuantType.QInt8,
             nodes_to_exclude=convolutions[:first],
