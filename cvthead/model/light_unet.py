@@ -77,8 +77,8 @@ class LightUNet(nn.Module):
             carry: False does without the warped portrait: an ablation.
 
         Returns:
-            RGB (b, 3, h, w) in [-1, 1]: warped pixels and painted ones, mixed by a learned gate;
-            mask logits (b, 1, h, w).
+            RGB (b, 3, h, w) in [-1, 1], a little beyond beside sharp edges: warped pixels and
+            painted ones, mixed by a learned gate; mask logits (b, 1, h, w).
         """
         if not carry:
             warped = torch.zeros_like(warped)
