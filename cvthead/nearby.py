@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from cvthead.deformation import to_pixels
 from cvthead.points import PointLayout
 
 Array = NDArray[np.float32]
@@ -40,15 +43,14 @@ def nearby_colours(
     distance, number = cKDTree(points[shown]).query(points[hidden], count)
     weight = 1 / (distance.reshape(-1, count) + CLOSE)
     weight /= weight.sum(1, keepdims=True)
-    colours = _sampled(source[:3], points[shown])[number.reshape(-1, count)]
-    out[hidden] = (colours * weight[..., None]).sum(1)
+    image = np.ascontiguousarray(source[:3].transpose(1, 2, 0))
+    colours = sampled(image, to_pixels(points[shown], len(image)))
+    out[hidden] = (colours[number.reshape(-1, count)] * weight[..., None]).sum(1)
     return out
 
 
-def _sampled(image: Array, points: Array) -> Array:
-    """(3, S, S) at normalised points (P, 2+) -> (P, 3), bilinear, the border continued."""
-    size = image.shape[-1]
-    x, y = ((points[:, :2] * 0.5 + 0.5) * size - 0.5).T.astype(np.float32)[..., None]
-    pixels = np.ascontiguousarray(image.transpose(1, 2, 0))
-    found = cv2.remap(pixels, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(found, np.float32).reshape(-1, 3)
+def sampled(image: NDArray[Any], pixels: NDArray[np.floating]) -> Array:
+    """(S, S, C) at pixel positions (N, 2+), bilinear, the border continued: (N, C) float32."""
+    place = (pixels[:, None, :2] - 0.5).astype(np.float32)
+    found = cv2.remap(image, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+    return np.asarray(found, np.float32).reshape(len(pixels), -1)

@@ -23,7 +23,6 @@ from cvthead.errors import AssetError, AvatarFileError, ModelChangedError
 from cvthead.frame import Frame
 from cvthead.head.arkit import ArkitMap
 from cvthead.head.model import HeadModel
-from cvthead.nearby import nearby_colours
 from cvthead.points import FAR_AWAY, PointLayout
 from cvthead.runtime.model_folder import packaged
 from cvthead.runtime.networks import Networks
@@ -148,8 +147,7 @@ class Pipeline:
 
     def describe(self, source: Source) -> NDArray[np.uint8]:
         """(P, C) descriptor codes of a source, unused shell points left out."""
-        nearby = nearby_colours(self.layout, source.network_input, source.points, source.visible)
-        return self.networks.describe(source, nearby)[: self._used(source)]
+        return self.networks.describe(source, source.nearby(self.layout))[: self._used(source)]
 
     def _used(self, source: Source) -> int:
         return self.layout.surface + len(source.deformation.shell_anchor)

@@ -12,6 +12,7 @@ from cvthead.coefficients import Coefficients
 from cvthead.crop import head_crop
 from cvthead.deformation import Deformation, DeformationModel, points, to_pixels
 from cvthead.head.model import HeadModel, Region
+from cvthead.nearby import nearby_colours
 from cvthead.points import PointLayout
 from cvthead.runtime.place import SEEN, SEEN_MIRRORED
 from cvthead.silhouette import person_mask
@@ -64,6 +65,10 @@ class Source:
     def places(self, layout: PointLayout) -> Array:
         """(P, 3) each point's x and y in the portrait, and how the portrait sees it."""
         return places(layout, self.points, self.visible)
+
+    def nearby(self, layout: PointLayout) -> Array:
+        """(P, 3) colours around the points that the portrait hides, see cvthead.nearby."""
+        return nearby_colours(layout, self.network_input, self.points, self.visible)
 
     @property
     def network_input(self) -> Array:

@@ -1,4 +1,5 @@
-"""tools/latency_plot.py and tools/footprint.py: what they print, not how fast it is."""
+"""tools/latency_plot.py and tools/footprint.py: what they print, not how fast it is; and
+tools/st_lpips_parts.py: that what it replaces or moves lies nearer to the target."""
 
 from __future__ import annotations
 
@@ -11,8 +12,14 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from cvthead import Pipeline
+from cvthead.evaluation.methods import Drawn
+from cvthead.evaluation.shots import Shot, shoot
+from cvthead.images import read_image
+from cvthead.sample import SAMPLE
 from tools.footprint import base_dependencies, resident_bytes, service_lines
 from tools.latency_plot import measure, plot, table
+from tools.st_lpips_parts import pictures, regions
 
 TIMINGS = {1: {1: 20.0, 2: 40.0}, 2: {1: 10.0, 2: 30.0}}
 
@@ -70,3 +77,30 @@ def test_the_service_is_started_measured_and_stopped(tmp_path: Path) -> None:
     ]
     for line, pattern in zip(lines, patterns, strict=True):
         assert re.fullmatch(pattern, line)
+
+
+@pytest.fixture(scope="module")
+def shot(pipeline: Pipeline) -> Shot:
+    found = shoot(pipeline.tracker, "sample", 0, read_image(SAMPLE))
+    assert found is not None
+    return found
+
+
+def test_every_pixel_belongs_to_one_part_of_the_person(pipeline: Pipeline, shot: Shot) -> None:
+    parts = list(regions(pipeline.head, shot).values())
+    assert all(part.mean() > 0.05 for part in parts)
+    assert (np.sum(parts, axis=0) == 1).all()
+
+
+def test_parts_replaced_or_moved_lie_nearer_to_the_target(pipeline: Pipeline, shot: Shot) -> None:
+    head = shot.head
+    shifted = Drawn(np.roll(head.image, 3, axis=1), np.roll(head.mask, 3, axis=1))
+    shown = pictures(pipeline.head, shot, shot, shifted)
+    target = pictures(pipeline.head, shot, shot, Drawn(head.image, head.mask))["the result"]
+    off = {name: float(np.abs(picture - target).mean()) for name, picture in shown.items()}
+    assert off["copy of the source"] == 0
+    assert off["moved: everything"] < 0.5 * off["the result"]
+    replaced = [value for name, value in off.items() if name.startswith("replaced")]
+    assert max(replaced) < off["the result"]
+    blurred = [value for name, value in off.items() if name.startswith("the target")]
+    assert 0 < blurred[0] < blurred[1] < blurred[2]

@@ -28,7 +28,6 @@ from cvthead.head.hierarchy import MeshHierarchy
 from cvthead.images import read_image
 from cvthead.model.config import OPEN
 from cvthead.model.cvthead import CVTHead
-from cvthead.nearby import nearby_colours
 from cvthead.pipeline import Pipeline
 from cvthead.points import FAR_AWAY
 from cvthead.runtime.model_folder import WEIGHTS, packaged
@@ -71,9 +70,7 @@ class FloatNetwork:
         anchor = np.zeros(MAX_SHELL_POINTS, np.int64)
         anchor[: len(source.deformation.shell_anchor)] = source.deformation.shell_anchor
         visible = source.visible.astype(np.float32)
-        nearby = nearby_colours(
-            self.pipeline.layout, source.network_input, source.points, source.visible
-        )
+        nearby = source.nearby(self.pipeline.layout)
         inputs = (source.network_input, source.points, visible, anchor, nearby)
         return self.model.describe(*(torch.from_numpy(x)[None] for x in inputs))
 

@@ -17,6 +17,7 @@ from cvthead.coefficients import Coefficients
 from cvthead.deformation import Deformation, points
 from cvthead.evaluation.rasteriser import owners, shade
 from cvthead.head.model import HeadModel
+from cvthead.nearby import sampled
 
 Array = NDArray[np.float32]
 
@@ -70,7 +71,7 @@ class ColouredMesh:
             head,
             coefficients,
             deformation,
-            fill(sampled(crop, projected), seen, head.mirror, posed),
+            fill(sampled(crop, projected) / np.float32(255), seen, head.mirror, posed),
         )
 
     def render(
@@ -122,13 +123,6 @@ def visible(
     column, row = np.clip(pixel, 0, size - 1).T
     front = projected[:, 2] <= depth[row, column] + tolerance
     return np.asarray(inside & inner[row, column] & front)
-
-
-def sampled(image: NDArray[np.uint8], projected: Array) -> Array:
-    """Bilinear colours (N, 3) in 0..1 at pixel positions (N, 2 or 3)."""
-    place = (projected[:, None, :2] - 0.5).astype(np.float32)
-    colours = cv2.remap(image, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
-    return np.asarray(colours.reshape(-1, 3) / 255, dtype=np.float32)
 
 
 def fill(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cvthead.deformation import MAX_SHELL_POINTS
 from cvthead.errors import AssetError
 from cvthead.runtime.mix import mix
-from cvthead.runtime.model_folder import DESCRIBE, PAINT, ModelFolder
+from cvthead.runtime.model_folder import DESCRIBE, HINT, PAINT, ModelFolder
 from cvthead.runtime.place import Placed, code_size
 from cvthead.runtime.sessions import CPU, open_session
 from cvthead.runtime.subpixels import unshuffled
@@ -76,7 +76,7 @@ class Networks:
         if {each.name for each in describe.get_inputs()} != set(DESCRIBE_INPUTS):
             raise AssetError(
                 f"{path} was exported by another version of cvthead",
-                hint="export its run again with cvthead.training.export",
+                hint=HINT,
             )
         _, size, _, channels = paint.get_inputs()[0].shape
         descriptors = channels - code_size(0)
