@@ -22,6 +22,8 @@ from cvthead.coefficients import EXPRESSION_SIZE, POSE_SIZE, SHAPE_SIZE, Coeffic
 from cvthead.deformation import MAX_SHELL_POINTS, Deformation
 from cvthead.files import write_file
 from cvthead.images import DAMAGE
+from cvthead.runtime.ghosts import nearest_points
+from cvthead.runtime.place import SEEN
 
 FORMAT = "cvthead-avatar"
 VERSION = "3"
@@ -91,6 +93,12 @@ class Avatar:
     def exact_places(self) -> NDArray[np.float32]:
         """The places in single precision, converted once."""
         return self.places.astype(np.float32)
+
+    @cached_property
+    def owners(self) -> NDArray[np.int32]:
+        """The point that each pixel of the portrait belongs to, found once; see
+        cvthead.runtime.ghosts."""
+        return nearest_points(self.exact_places, self.exact_places[:, 2] == SEEN)
 
     def to_bytes(self) -> bytes:
         """One safetensors file of less than 1 MB."""

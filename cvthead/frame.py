@@ -17,7 +17,8 @@ class Frame:
     """What the U-Net painted.
 
     Attributes:
-        rgb: (256, 256, 3) uint8; meaningless where alpha is 0.
+        rgb: (256, 256, 3) uint8; where alpha is 0, the open preset goes on with the colours of the
+            person's edge, and the official one with what its U-Net painted there.
         alpha: (256, 256) uint8 foreground mask.
     """
 

@@ -10,12 +10,26 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from cvthead.deformation import to_pixels
+from cvthead.head.model import Region
 from cvthead.points import PointLayout
+from cvthead.visibility import eroded, inside_mask
 
 Array = NDArray[np.float32]
 
+# Which parts of the head lend each other colours: a bald crown takes none from hair, nor hair any
+# from an ear.
+KINDS = (
+    (Region.SCALP,),
+    (Region.FACE, Region.EARS, Region.NECK),
+    (Region.SHOULDERS,),
+    (Region.EYES,),
+    (Region.MOUTH,),
+)
 NEAREST = 8  # points that are averaged
 CLOSE = 0.01  # normalised distance below which all weigh nearly the same
+# Pixels of the 256 x 256 crop. Beside the outline hair is mixed with the background, and the points
+# there are the nearest of a whole back of the head.
+RIM = 4
 
 
 def nearby_colours(
@@ -36,17 +50,31 @@ def nearby_colours(
     out = np.zeros((len(points), 3), np.float32)
     known = visible.copy()
     known[: layout.surface] |= visible[layout.mirror]
-    hidden, shown = np.flatnonzero(~known), np.flatnonzero(visible)
-    if not len(shown) or not len(hidden):
+    within = visible & inside_mask(points, eroded(source[3], RIM))
+    everything = np.flatnonzero(within if within.any() else visible)
+    if not len(everything):
         return out
+    image = np.ascontiguousarray(source[:3].transpose(1, 2, 0))
+    shell = np.arange(layout.surface, len(points))
+    kinds = [np.flatnonzero(np.isin(layout.region, kind)) for kind in KINDS]
+    for kind in (*kinds, shell):
+        hidden, alike = kind[~known[kind]], kind[within[kind]]
+        shown = alike if len(alike) >= NEAREST else everything
+        if len(hidden):
+            out[hidden] = _mean_colours(image, points, hidden, shown)
+    return out
+
+
+def _mean_colours(
+    image: Array, points: Array, hidden: NDArray[np.intp], shown: NDArray[np.intp]
+) -> Array:
+    """(H, 3) around the hidden points, of those that are shown."""
     count = min(NEAREST, len(shown))
     distance, number = cKDTree(points[shown]).query(points[hidden], count)
     weight = 1 / (distance.reshape(-1, count) + CLOSE)
     weight /= weight.sum(1, keepdims=True)
-    image = np.ascontiguousarray(source[:3].transpose(1, 2, 0))
     colours = sampled(image, to_pixels(points[shown], len(image)))
-    out[hidden] = (colours[number.reshape(-1, count)] * weight[..., None]).sum(1)
-    return out
+    return np.asarray((colours[number.reshape(-1, count)] * weight[..., None]).sum(1), np.float32)
 
 
 def sampled(image: NDArray[Any], pixels: NDArray[np.floating]) -> Array:

@@ -192,6 +192,7 @@ class Pipeline:
             self.layout,
             points,
             avatar.exact_places,
+            avatar.owners,
             avatar.descriptors,
             avatar.portrait,
             self.networks.splat_size,

@@ -28,6 +28,7 @@ class PointLayout:
         vertices: N, mesh vertices.
         edges: (D, 2) end vertices of each midpoint.
         mirror: (N + D,) the mirrored counterpart of each point.
+        region: (N + D,) Region of each point; a midpoint has its first vertex's.
         detail_vertices: (V,) vertices of face, eyes and mouth.
         detail_faces: (F, 3) triangles between those, numbered within detail_vertices.
     """
@@ -35,6 +36,7 @@ class PointLayout:
     vertices: int
     edges: NDArray[np.int32]
     mirror: NDArray[np.int32]
+    region: NDArray[np.integer]
     detail_vertices: NDArray[np.int64]
     detail_faces: NDArray[np.int32]
 
@@ -54,6 +56,7 @@ class PointLayout:
             count,
             edges.astype(np.int32),
             mirror.astype(np.int32),
+            np.concatenate([head.region, head.region[edges[:, 0]]]),
             own.astype(np.int64),
             faces.reshape(-1, 3).astype(np.int32),
         )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cvthead.head.model import HeadModel
+from cvthead.head.model import HeadModel, Region
 from cvthead.nearby import NEAREST, nearby_colours
 from cvthead.points import PointLayout
 
@@ -47,12 +47,42 @@ def test_a_hidden_point_takes_the_colour_beside_it(
     known = visible.copy()
     known[: layout.surface] |= visible[layout.mirror]
     assert not found[known].any()
-    left = ~known & (points[:, 0] < 0)
-    right = ~known & (points[:, 0] > 0)
+    # Of smaller parts the nearest points shown may lie in the other half.
+    large = np.zeros(layout.total, np.bool_)
+    large[: layout.surface] = np.isin(layout.region, [Region.FACE, Region.SCALP])
+    left = large & ~known & (points[:, 0] < 0)
+    right = large & ~known & (points[:, 0] > 0)
     assert left.sum() > 1000
     assert right.sum() > 1000
     assert np.allclose(found[left], LEFT, atol=1e-5)
     assert np.allclose(found[right], RIGHT, atol=1e-5)
+
+
+def test_hair_takes_no_colour_from_skin(layout: PointLayout, source: Array) -> None:
+    scalp, face = (np.flatnonzero(layout.region == kind) for kind in (Region.SCALP, Region.FACE))
+    points = np.zeros((layout.total, 3), np.float32)
+    points[scalp] = (-0.5, 0, 0)
+    points[face] = (0.5, 0, 0)
+    # Hidden hair beside the face, far from what is seen of the hair.
+    points[scalp[:50]] = (0.5, 0, 0.1)
+    visible = np.zeros(layout.total, np.bool_)
+    visible[scalp[50:]] = visible[face] = True
+    hidden = scalp[:50][~visible[layout.mirror[scalp[:50]]]]
+    assert len(hidden)
+    assert np.allclose(nearby_colours(layout, source, points, visible)[hidden], LEFT, atol=1e-5)
+
+
+def test_the_rim_of_the_person_lends_no_colour(layout: PointLayout) -> None:
+    size = 64
+    source = np.zeros((4, size, size), np.float32)
+    source[:, 16:48, 16:48] = 1
+    source[:3, 18:46, 18:46] = -0.5
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.48, 0.48, (layout.total, 3)).astype(np.float32)
+    visible = rng.random(layout.total) < 0.3
+    found = nearby_colours(layout, source, points, visible)
+    assert (found != 0).any()
+    assert np.allclose(found[(found != 0).any(1)], -0.5, atol=1e-5)
 
 
 def test_nearer_points_weigh_more(layout: PointLayout, source: Array) -> None:

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cvthead.runtime.edges import continued
 from cvthead.runtime.subpixels import shuffled
 
 Codes = NDArray[np.uint8]
@@ -31,7 +32,7 @@ def mix(codes: Codes, warped: Codes, reach: Codes) -> Codes:
         reach: (2s, 2s) highest alpha.
 
     Returns:
-        (2s, 2s, 4) RGBA.
+        (2s, 2s, 4) RGBA; beyond the person, colours go on as cvthead.runtime.edges says.
     """
     fours = codes.view(np.uint32)  # a block's four pixels, then its four gates
     pixels = shuffled(np.ascontiguousarray(fours[..., :GATES]))
@@ -41,7 +42,7 @@ def mix(codes: Codes, warped: Codes, reach: Codes) -> Codes:
     out = cv2.blendLinear(warped, painted, gate, 1 - gate)
     alpha = cv2.min(cv2.LUT(cv2.extractChannel(painted, 3), ALPHA), reach)
     cv2.insertChannel(alpha, out, 3)
-    return np.asarray(out, np.uint8)
+    return continued(np.asarray(out, np.uint8))
 
 
 def evened(image: NDArray[np.generic]) -> Codes:

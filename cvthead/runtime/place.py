@@ -4,7 +4,8 @@ A descriptor per point cannot hold every hair and pore. But each point knows whe
 shows it, so the splat also gives a flow from the driven frame back to the portrait; read through
 it, the portrait is a sharp first guess of everything the source saw. The face, whose lids, irises
 and lips move by less than a pixel of the splat, gets its flow from its triangles at full
-resolution. What of it the portrait hides is taken from the other side, if that is seen.
+resolution. What of it the portrait hides is taken from the other side, if that is seen. What shows
+a second time where it no longer is (cvthead/runtime/ghosts.py) is taken out.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 
 from cvthead.points import PointLayout
 from cvthead.runtime.fill import FILL_LEVELS, ZERO, fill
+from cvthead.runtime.ghosts import ghosts
 from cvthead.runtime.splat import EMPTY_DEPTH, splat
 from cvthead.runtime.triangles import FAR, rasterise
 from cvthead.runtime.warp import dense_flow, warp
@@ -29,6 +31,8 @@ DEPTH_RANGE = 1.5  # normalised depths of a head in its crop lie well within -1.
 CODE_STEPS = 127  # codes of a range on either side of ZERO
 CLOSING = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9))  # closes gaps between points
 SOFT_EDGE = np.ones((3, 3), np.uint8)
+SPECK = np.ones((2, 2), np.uint8)
+NOBODY = (ZERO, ZERO, ZERO, 0)  # of the portrait, where it shows no person
 BEHIND = 0.06  # normalised depth, about 10 mm: further back a triangle lies behind the splat
 LARGEST_FLOW = 2.0  # normalised: twice the picture's half width
 
@@ -57,6 +61,7 @@ def place(
     layout: PointLayout,
     points: Array,
     places: Array,
+    owners: NDArray[np.int32],
     descriptors: Codes,
     portrait: Codes,
     size: int,
@@ -67,6 +72,7 @@ def place(
         layout: numbering of the points.
         points: (P, 3) normalised driven projections.
         places: (P, 3) each point's x and y in the portrait and how it is seen.
+        owners: of cvthead.runtime.ghosts.nearest_points.
         descriptors: (P, C) codes; C may be 0.
         portrait: (256, 256, 4), see Avatar.
         size: of the splat, half of the frame's.
@@ -89,14 +95,20 @@ def place(
     x, y, seen, depth = (np.asarray(plane, np.float32) for plane in planes)
 
     flow = dense_flow(x, y, (seen == SEEN).astype(np.float32), 2 * size)
-    _refine(flow, layout, points, places, depth)
-    warped = warp(portrait, flow)
-    codes = np.empty((size, size, code_size(descriptors.shape[1])), np.uint8)
+    small = np.asarray(cv2.resize(flow, (size, size), interpolation=cv2.INTER_AREA), np.float32)
     known = depth > EMPTY_DEPTH
+    covered: Codes = np.asarray(
+        cv2.morphologyEx(known.view(np.uint8), cv2.MORPH_CLOSE, CLOSING), np.uint8
+    )
+    lost = ghosts(small, points, places, owners, covered > 0)
+    refined = _refine(flow, layout, points, places, depth)
+    warped = warp(portrait, flow)
+    _take_out(warped, lost, refined)
+    codes = np.empty((size, size, code_size(descriptors.shape[1])), np.uint8)
     filled, codes[..., -FILL_LEVELS:] = fill(values.reshape(size, size, -1), known)
     codes[..., : filled.shape[2]] = filled
     codes[..., filled.shape[2]] = np.rint(seen * 255)
-    return Placed(codes, warped, reach_of(known, warped))
+    return Placed(codes, warped, reach_of(covered, warped))
 
 
 def coded(values: Array, largest: float) -> Codes:
@@ -105,15 +117,30 @@ def coded(values: Array, largest: float) -> Codes:
     return np.asarray(steps + ZERO, np.uint8)
 
 
-def _refine(flow: Array, layout: PointLayout, points: Array, places: Array, depth: Array) -> None:
-    """Replace the flow (size, size, 2) where the face's triangles are in front."""
+def _take_out(warped: Codes, lost: Array, kept: NDArray[np.bool_]) -> None:
+    """Blend the carried portrait (2s, 2s, 4) with nobody as far as it is lost (s, s), except where
+    it is surely kept (2s, 2s)."""
+    if not lost.any():
+        return
+    wide = cv2.morphologyEx(lost, cv2.MORPH_OPEN, SPECK)  # single pixels are errors of the grid
+    gone = cv2.resize(wide, warped.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+    gone[kept] = 0
+    nobody = np.empty_like(warped)
+    nobody[:] = NOBODY
+    cv2.blendLinear(warped, nobody, 1 - gone, gone, warped)
+
+
+def _refine(
+    flow: Array, layout: PointLayout, points: Array, places: Array, depth: Array
+) -> NDArray[np.bool_]:
+    """Replace the flow (size, size, 2) where the face's triangles are in front: (size, size)."""
     size, own = flow.shape[0], layout.detail_vertices
     corners, faces = points[own], layout.detail_faces
     away = _votes(corners[:, 2] >= FAR, faces) > 0
     if away.any():
         faces = faces[~away]
     if not len(faces):
-        return
+        return np.zeros((size, size), np.bool_)
     sources = places[own]
     seen = sources[:, 2] == SEEN
     across = sources[:, 2] == SEEN_MIRRORED
@@ -138,6 +165,7 @@ def _refine(flow: Array, layout: PointLayout, points: Array, places: Array, dept
     carried = np.empty_like(flow)
     cv2.mixChannels([image], [carried], [0, 0, 1, 1])
     cv2.copyTo(carried, found.view(np.uint8), flow)
+    return np.asarray(found)
 
 
 def _votes(chosen: NDArray[np.bool_], faces: NDArray[np.int32]) -> NDArray[np.uint8]:
@@ -147,14 +175,13 @@ def _votes(chosen: NDArray[np.bool_], faces: NDArray[np.int32]) -> NDArray[np.ui
     return np.asarray(counted[first] + counted[second] + counted[third])
 
 
-def reach_of(known: NDArray[np.bool_], warped: Codes) -> Codes:
-    """(2s, 2s) uint8: 255 where points lie (s, s) or the carried portrait shows the person.
+def reach_of(covered: Codes, warped: Codes) -> Codes:
+    """(2s, 2s) uint8: 255 where points lie, 1 in (s, s), or the carried portrait shows the person.
 
     Beyond the edge of a portrait nothing is known. Training pictures end there as well, so the
     network was never told to leave it empty.
     """
-    closed = cv2.morphologyEx(known.view(np.uint8) * 255, cv2.MORPH_CLOSE, CLOSING)
     size = warped.shape[0]
-    points = cv2.resize(closed, (size, size), interpolation=cv2.INTER_LINEAR)
+    points = cv2.resize(covered * np.uint8(255), (size, size), interpolation=cv2.INTER_LINEAR)
     person = cv2.dilate(cv2.extractChannel(warped, 3), SOFT_EDGE)
     return np.asarray(cv2.max(points, person), np.uint8)

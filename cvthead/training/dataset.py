@@ -1,7 +1,8 @@
 """Training samples: one source, a few driven views of the same person.
 
 A clip's views are other frames of it. A still's views are itself and its mirror image: the
-mirrored face, seen from the other side, is what the hidden half should look like.
+mirrored face, seen from the other side, is what the hidden half should look like. Instead of itself
+it often shows what its points alone say of a view far away (cvthead/training/imagined.py).
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ from cvthead.head.model import HeadModel
 from cvthead.model.config import OPEN
 from cvthead.nearby import nearby_colours
 from cvthead.points import FAR_AWAY, PointLayout
-from cvthead.runtime.place import Placed, place
+from cvthead.runtime.ghosts import nearest_points
+from cvthead.runtime.place import SEEN, Placed, place
 from cvthead.source import (
     as_network_input,
     driven_points,
@@ -34,6 +36,7 @@ from cvthead.source import (
 )
 from cvthead.training.augmentation import UNCHANGED, colour_jitter, degraded, jittered
 from cvthead.training.details import ZOOMED, detail_weights, unseen_weights, zoom_corner
+from cvthead.training.imagined import imagined, turned
 from cvthead.training.records import Frame, open_records
 from cvthead.training.sampling import group_shares, turned_still
 from cvthead.visibility import inside_mask, on_person
@@ -42,6 +45,7 @@ Array = NDArray[np.float32]
 
 VIEWS = 2
 CLIP_SHARE = 0.6
+IMAGINED_SHARE = 0.6  # of the stills
 CANDIDATES = 3  # frames drawn per view of a clip; the one that differs most from the source stays
 
 
@@ -136,6 +140,8 @@ class PairDataset(Dataset[dict[str, Tensor]]):
         else:
             view = as_view(source, own)
             views = [view, replace(mirrored(view, self.layout), carries_shell=False)]
+            if self.augment and rng.random() < IMAGINED_SHARE:
+                views[0] = self._imagined(rng, source, deformation, own, visible > 0)
         colours = colour_jitter(rng) if self.augment else UNCHANGED
         image, mask = source.image, source.mask
         if self.augment:
@@ -198,11 +204,28 @@ class PairDataset(Dataset[dict[str, Tensor]]):
             for name, value in stack.items()
         }
 
+    def _imagined(
+        self,
+        rng: np.random.Generator,
+        source: Frame,
+        deformation: Deformation,
+        own: Array,
+        visible: NDArray[np.bool_],
+    ) -> View:
+        """The source turned far, by what its points show."""
+        posed, camera = turned(rng, self.head, source.coefficients, source.camera)
+        points = driven_points(self.head, self.layout, posed, deformation, camera)
+        drawn = np.where(on_person(own, source.mask)[:, None], points, FAR_AWAY)
+        shown = visible & inside_mask(own, source.mask)
+        image, mask = imagined(self.layout, source.image, source.mask, own, shown, drawn, self.size)
+        return View(image, mask, np.ones_like(mask), points)
+
     def _placed(self, driven: Array, at: Array, portrait: NDArray[np.uint8]) -> Placed:
         """The portrait carried to the driven points."""
         splat_size = self.size // OPEN.unet_unshuffle
         nothing = np.empty((len(driven), 0), np.uint8)
-        return place(self.layout, driven, at, nothing, portrait, splat_size)
+        owners = nearest_points(at, at[:, 2] == SEEN)
+        return place(self.layout, driven, at, owners, nothing, portrait, splat_size)
 
 
 def targets(views: Sequence[View], size: int) -> dict[str, Array]:

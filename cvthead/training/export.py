@@ -33,10 +33,11 @@ from cvthead.model.config import OPEN
 from cvthead.model.cvthead import CVTHead
 from cvthead.model.light_unet import PIXEL_SIZE, PORTRAIT_SIZE
 from cvthead.points import PointLayout
+from cvthead.runtime.ghosts import nearest_points
 from cvthead.runtime.mix import LOGIT_RANGE
 from cvthead.runtime.model_folder import DESCRIBE, PAINT, WEIGHTS, write_record
 from cvthead.runtime.networks import DESCRIBE_INPUTS
-from cvthead.runtime.place import Placed, place
+from cvthead.runtime.place import SEEN, Placed, place
 from cvthead.source import places, portrait_pixels
 from cvthead.training.checkpoint import averaged, read
 from cvthead.training.dataset import PairDataset
@@ -125,8 +126,9 @@ def frames(
     for sample in calibration:
         codes = session.run(None, {name: sample[name][None] for name in DESCRIBE_INPUTS})[0][0]
         at = places(layout, sample["points"], sample["visible"] > 0)
+        owners = nearest_points(at, at[:, 2] == SEEN)
         portrait = portrait_pixels(sample["source"])
-        out.append(place(layout, sample["driven"][0], at, codes, portrait, SPLAT_SIZE))
+        out.append(place(layout, sample["driven"][0], at, owners, codes, portrait, SPLAT_SIZE))
     return out
 
 

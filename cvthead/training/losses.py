@@ -10,7 +10,7 @@ from cvthead.training.details import ZOOM_SIDE
 
 WINDOW = 0.75  # side, as a share of the view's
 ZOOM_SHARE = 0.3  # of the steps, whose perceptual loss sees enlarged eyes or mouths
-TRUE_MASK_SHARE = 0.45  # of the steps, whose perceptual loss sees the colours under the true mask
+TRUE_MASK_SHARE = 0.2  # of the steps, whose perceptual loss sees the colours under the true mask
 
 
 def window(place: Tensor, size: int) -> tuple[slice, slice]:

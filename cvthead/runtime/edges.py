@@ -1,0 +1,45 @@
+"""Beyond the person's edge, the colours at the edge go on outwards.
+
+At a soft edge the network's colours hold some of what was behind the person, and beyond it they
+mean nothing. A picture of straight alpha is scaled, blurred and cut out anew by those who use it,
+and then a wrong colour shows as a fringe.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Codes = NDArray[np.uint8]
+
+SOLID = 230  # alpha from which a colour is the person's alone
+
+
+def continued(rgba: Codes) -> Codes:
+    """Every pixel that is not solid gets the colour of the nearest one that is.
+
+    Found at half the resolution, at a quarter of the time.
+
+    Args:
+        rgba: (s, s, 4), straight alpha; s is even.
+
+    Returns:
+        (s, s, 4) of the same alpha; the same picture where nothing is solid.
+    """
+    alpha = cv2.extractChannel(rgba, 3)
+    solid = cv2.compare(alpha, SOLID, cv2.CMP_GE)
+    known = solid[::2, ::2] > 0
+    if not known.any():
+        return rgba
+    _, labels = cv2.distanceTransformWithLabels(
+        (~known).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    colours = np.ascontiguousarray(rgba[::2, ::2]).view(np.uint32)[..., 0]  # four bytes at once
+    table = np.zeros(int(labels.max()) + 1, np.uint32)
+    table[labels[known]] = colours[known]
+    nearest = table.take(labels)[..., None].view(np.uint8)
+    out = cv2.resize(nearest, rgba.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+    out = cv2.copyTo(rgba, solid, out)
+    cv2.insertChannel(alpha, out, 3)
+    return np.asarray(out, np.uint8)

@@ -1,0 +1,88 @@
+"""Where the carried portrait shows something that has moved elsewhere.
+
+Between the points and beyond the outline the flow is guessed from the points around. When the head
+turns far, that repeats hair, an eye or a collar beside the place where the points show them. But
+each pixel of the portrait belongs to the nearest point that the portrait sees, and where that point
+has gone is known.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+OWNER_PIXELS = 128  # of the portrait's side: finer than the points lie
+# Normalised: 9 pixels of 256, which a stretched surface strays between neighbouring points; and 4
+# beside all points, where the flow of the outline goes on. What strays by SURE times as much is
+# gone altogether; in between it fades, or it would flicker in motion.
+TOLERANCE, TOLERANCE_OUTSIDE = 0.07, 0.03
+SURE = 1.5
+
+
+def nearest_points(places: Array, seen: Mask) -> NDArray[np.int32]:
+    """The point that each pixel of the portrait belongs to; depends on the portrait alone.
+
+    Args:
+        places: (P, 2+) each point's normalised x and y in the portrait.
+        seen: (P,) which of them the portrait sees.
+
+    Returns:
+        (OWNER_PIXELS, OWNER_PIXELS) number of the nearest seen point, -1 if none is seen.
+    """
+    size = OWNER_PIXELS
+    numbers = np.flatnonzero(seen)
+    column, row = _pixels(places[numbers, 0], size), _pixels(places[numbers, 1], size)
+    empty = np.ones((size, size), np.uint8)
+    empty[row, column] = 0
+    if empty.all():
+        return np.full((size, size), -1, np.int32)
+    _, labels = cv2.distanceTransformWithLabels(
+        empty, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    point = np.empty(labels.max() + 1, np.int32)
+    point[labels[row, column]] = numbers
+    return np.asarray(point[labels], np.int32)
+
+
+def ghosts(
+    flow: Array, points: Array, places: Array, owners: NDArray[np.int32], covered: Mask
+) -> Array:
+    """How surely each pixel's piece of the portrait has moved elsewhere.
+
+    Args:
+        flow: (s, s, 2) from each pixel of the frame to the portrait, normalised.
+        points: (P, 3) normalised driven projections.
+        places: (P, 2+) as for :func:`nearest_points`.
+        owners: from there.
+        covered: (s, s) where points lie.
+
+    Returns:
+        (s, s), 0..1.
+    """
+    if owners[0, 0] < 0:
+        return np.zeros(flow.shape[:2], np.float32)
+    way = points[:, :2] - places[:, :2]
+    moved = way.take(owners.ravel(), axis=0).reshape(*owners.shape, 2)
+    # Normalised -> pixel index of the portrait: centre of the first pixel is 0 for OpenCV.
+    size, side = len(flow), len(owners)
+    line = (np.arange(size, dtype=np.float32) + np.float32(0.5)) * np.float32(side / size)
+    there = flow * np.float32(side / 2)
+    there[..., 0] += line - np.float32(0.5)
+    there[..., 1] += (line - np.float32(0.5))[:, None]
+    back = cv2.remap(  # type: ignore[call-overload]
+        moved, there, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE
+    )
+    x, y = cv2.split(cv2.add(back, flow))
+    strict = np.where(covered, np.float32(TOLERANCE**-2), np.float32(TOLERANCE_OUTSIDE**-2))
+    beyond = (x * x + y * y) * strict - np.float32(1)
+    return np.asarray((beyond * np.float32(1 / (SURE**2 - 1))).clip(0, 1), np.float32)
+
+
+def _pixels(coordinates: Array, size: int) -> NDArray[np.intp]:
+    """Normalised -> number of the pixel, those beyond the border moved to it."""
+    place = (coordinates + np.float32(1)) * np.float32(size / 2)
+    return place.astype(np.intp).clip(0, size - 1)

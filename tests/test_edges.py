@@ -1,0 +1,58 @@
+"""Colours at the person's edge and beyond."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cvthead import Avatar, Pipeline
+from cvthead.runtime.edges import SOLID, continued
+
+RED, BLUE, GREEN = (200, 20, 30), (10, 40, 220), (0, 255, 0)
+
+
+@pytest.fixture
+def person() -> NDArray[np.uint8]:
+    """A square, red on the left and blue on the right, with a soft green rim on a green ground."""
+    image = np.zeros((128, 128, 4), np.uint8)
+    image[..., :3] = GREEN
+    image[30:98, 30:98, 3] = 120
+    image[33:95, 33:95, 3] = 255
+    image[33:95, 33:64, :3] = RED
+    image[33:95, 64:95, :3] = BLUE
+    return image
+
+
+def test_what_is_solid_stays_and_so_does_the_alpha(person: NDArray[np.uint8]) -> None:
+    before = person.copy()
+    out = continued(person)
+    solid = person[..., 3] >= SOLID
+    assert np.array_equal(person, before)
+    assert np.array_equal(out[..., 3], person[..., 3])
+    assert np.array_equal(out[solid], person[solid])
+
+
+def test_beyond_the_edge_comes_the_nearest_colour(person: NDArray[np.uint8]) -> None:
+    out = continued(person)
+    for place in ((64, 31), (64, 2), (2, 40), (0, 0)):
+        assert np.allclose(out[place][:3], RED, atol=2)
+    for place in ((64, 96), (64, 126), (126, 90), (127, 127)):
+        assert np.allclose(out[place][:3], BLUE, atol=2)
+    assert not (out[..., 1] > 60).any()  # no green is left
+
+
+def test_without_a_person_nothing_changes(person: NDArray[np.uint8]) -> None:
+    person[..., 3] = SOLID - 1
+    assert np.array_equal(continued(person), person)
+
+
+def test_a_frame_is_free_of_fringes(pipeline: Pipeline, avatar: Avatar) -> None:
+    """Scaled as straight alpha, as a game's textures are, no foreign colour comes in."""
+    frame = pipeline.render(avatar)
+    beyond = frame.alpha < 20
+    person = frame.rgb[frame.alpha > 250].reshape(-1, 3)
+    low, high = np.percentile(person, 0.5, axis=0), np.percentile(person, 99.5, axis=0)
+    outside = (frame.rgb[beyond] < low) | (frame.rgb[beyond] > high)
+    assert beyond.mean() > 0.1
+    assert outside.any(-1).mean() < 0.05
