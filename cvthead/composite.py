@@ -17,6 +17,7 @@ from cvthead.provenance import SourceType
 
 Colour = tuple[int, int, int]
 Background = Colour | Literal["transparent", "source"]
+FRINGE = np.ones((5, 5), np.uint8)  # two pixels to each side
 
 
 def background(text: str) -> Background:
@@ -72,10 +73,10 @@ class Composer:
         """(size, size, 3), or 4 channels when transparent."""
         if self.behind is not None:
             return resampled(frame.over(self.behind), self.size)
-        # Colours are meaningless where alpha is 0: they would only make a file larger, and must
-        # not be mixed in when the size changes.
+        # Colours far from the person only make a file larger; those beside it keep whoever scales
+        # the picture from a dark fringe.
         if self.size == CROP_PIXELS:
-            drawn = cv2.copyTo(frame.rgb, frame.alpha).astype(np.uint8, copy=False)
+            drawn = cv2.copyTo(frame.rgb, cv2.dilate(frame.alpha, FRINGE)).astype(np.uint8)
             return Frame(drawn, frame.alpha).rgba()
         alpha = frame.alpha[..., None].astype(np.float32) / 255
         layers = np.concatenate([frame.rgb * alpha, alpha * 255], axis=2)

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from cvthead import Avatar, Controls, Pipeline
 from cvthead.avatar import Avatar as AvatarType
 from cvthead.cache import AvatarCache
 from cvthead.coefficients import Coefficients
+from cvthead.composite import Composer
 from cvthead.errors import AvatarFileError, CoefficientsError, ModelChangedError, NoFaceError
 from cvthead.images import read_image
 from cvthead.runtime.model_folder import RECORD, packaged
@@ -212,6 +214,20 @@ def test_alpha_and_background(pipeline: Pipeline, avatar: AvatarType) -> None:
     assert np.array_equal(red[frame.alpha == 255], frame.rgb[frame.alpha == 255])
     assert frame.rgba().shape == (256, 256, 4)
     assert pipeline.background(avatar).shape == (256, 256, 3)
+
+
+def test_a_transparent_picture_keeps_the_colours_beside_the_person(
+    pipeline: Pipeline, avatar: AvatarType
+) -> None:
+    frame = pipeline.render(avatar)
+    composer = Composer.of("transparent", 256, pipeline.background(avatar))
+    picture = composer.picture(frame)
+    assert np.array_equal(picture[..., 3], frame.alpha)
+    person = (frame.alpha > 0).astype(np.uint8)
+    near = cv2.dilate(person, np.ones((3, 3), np.uint8)) > 0
+    far = cv2.dilate(person, np.ones((9, 9), np.uint8)) == 0
+    assert np.array_equal(picture[near][:, :3], frame.rgb[near])
+    assert not picture[far].any()
 
 
 def test_a_model_of_pixel_aligned_features_takes_every_point_as_seen(
