@@ -76,7 +76,8 @@ class Composer:
         # Colours far from the person only make a file larger; those beside it keep whoever scales
         # the picture from a dark fringe.
         if self.size == CROP_PIXELS:
-            drawn = cv2.copyTo(frame.rgb, cv2.dilate(frame.alpha, FRINGE)).astype(np.uint8)
+            beside = cv2.dilate(frame.alpha, FRINGE)
+            drawn = np.asarray(cv2.copyTo(frame.rgb, beside), np.uint8)
             return Frame(drawn, frame.alpha).rgba()
         alpha = frame.alpha[..., None].astype(np.float32) / 255
         layers = np.concatenate([frame.rgb * alpha, alpha * 255], axis=2)

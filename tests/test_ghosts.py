@@ -10,7 +10,7 @@ from cvthead import Avatar, Controls, Pipeline
 from cvthead.driving import at_neck
 from cvthead.runtime.fill import FILL_LEVELS
 from cvthead.runtime.ghosts import OWNER_PIXELS, SURE, TOLERANCE, ghosts, nearest_points
-from cvthead.runtime.place import place
+from cvthead.runtime.place import place, take_out
 
 Array = NDArray[np.float32]
 
@@ -19,9 +19,15 @@ SIZE = 128
 
 @pytest.fixture(scope="module")
 def places() -> Array:
-    """A grid of points, 6 pixels apart in 256."""
+    """A grid of points, 6 pixels apart in 256, and one that nobody sees."""
     line = np.linspace(-0.98, 0.98, 42, dtype=np.float32)
-    return np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    grid = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    return np.concatenate([grid, np.array([[9, 9]], np.float32)])
+
+
+@pytest.fixture(scope="module")
+def owners(places: Array) -> NDArray[np.int32]:
+    return nearest_points(places, places[:, 0] < 9)
 
 
 def centres() -> Array:
@@ -44,8 +50,9 @@ def test_each_pixel_belongs_to_the_nearest_point_that_is_seen() -> None:
     assert (own - best).max() < 4 / SIZE  # two pixels, for points are rounded to pixels
 
 
-def test_what_stays_or_moves_as_a_whole_is_no_ghost(places: Array) -> None:
-    owners = nearest_points(places, np.ones(len(places), np.bool_))
+def test_what_stays_or_moves_as_a_whole_is_no_ghost(
+    places: Array, owners: NDArray[np.int32]
+) -> None:
     covered = np.ones((SIZE, SIZE), np.bool_)
     for way in ((0, 0), (0.3, -0.2)):
         points = places + np.array(way, np.float32)
@@ -55,9 +62,8 @@ def test_what_stays_or_moves_as_a_whole_is_no_ghost(places: Array) -> None:
         assert not ghosts(flow, points, places, owners, covered)[known].any()
 
 
-def test_what_was_left_behind_is_a_ghost(places: Array) -> None:
+def test_what_was_left_behind_is_a_ghost(places: Array, owners: NDArray[np.int32]) -> None:
     """The right half moves up; the flow pretends that everything stayed."""
-    owners = nearest_points(places, np.ones(len(places), np.bool_))
     points = places.copy()
     points[places[:, 0] > 0, 1] -= 0.2
     covered = np.ones((SIZE, SIZE), np.bool_)
@@ -66,16 +72,14 @@ def test_what_was_left_behind_is_a_ghost(places: Array) -> None:
     assert (found[:, SIZE // 2 + 3 :] == 1).all()
 
 
-def test_beside_the_points_less_is_forgiven(places: Array) -> None:
-    owners = nearest_points(places, np.ones(len(places), np.bool_))
+def test_beside_the_points_less_is_forgiven(places: Array, owners: NDArray[np.int32]) -> None:
     points = places + np.array([0.05, 0], np.float32)
     still = np.zeros((SIZE, SIZE, 2), np.float32)
     covered = centres()[..., 0] < 0
     assert (ghosts(still, points, places, owners, covered) == ~covered).all()
 
 
-def test_between_kept_and_gone_it_fades(places: Array) -> None:
-    owners = nearest_points(places, np.ones(len(places), np.bool_))
+def test_between_kept_and_gone_it_fades(places: Array, owners: NDArray[np.int32]) -> None:
     still = np.zeros((SIZE, SIZE, 2), np.float32)
     covered = np.ones((SIZE, SIZE), np.bool_)
     found = []
@@ -87,11 +91,29 @@ def test_between_kept_and_gone_it_fades(places: Array) -> None:
     assert 0 < max(np.diff(found)) < 0.2
 
 
-def test_of_a_portrait_that_sees_nothing_there_are_none(places: Array) -> None:
-    owners = nearest_points(places, np.zeros(len(places), np.bool_))
+@pytest.mark.parametrize("seen", [True, False])
+def test_of_a_portrait_that_sees_nothing_or_everything_there_are_none(
+    seen: bool, places: Array
+) -> None:
+    owners = nearest_points(places, np.full(len(places), seen))
     assert (owners == -1).all()
     flow = np.ones((SIZE, SIZE, 2), np.float32)
     assert not ghosts(flow, places, places, owners, np.ones((SIZE, SIZE), np.bool_)).any()
+
+
+def test_a_block_is_taken_out_where_it_is_and_a_single_pixel_is_not() -> None:
+    lost = np.zeros((SIZE, SIZE), np.float32)
+    lost[40:60, 70:90] = 1
+    lost[10, 10] = 1
+    warped = np.full((2 * SIZE, 2 * SIZE, 4), 200, np.uint8)
+    kept = np.zeros((2 * SIZE, 2 * SIZE), np.bool_)
+    kept[80:100] = True
+    take_out(warped, lost, kept)
+    gone = warped[..., 3] < 100
+    assert gone[100:120, 140:180].all()
+    assert gone.sum() == 20 * 40
+    assert tuple(warped[110, 150]) == (128, 128, 128, 0)
+    assert (warped[80:100] == 200).all()
 
 
 def test_a_turned_head_has_no_second_outline(pipeline: Pipeline, avatar: Avatar) -> None:

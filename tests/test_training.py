@@ -153,13 +153,40 @@ def test_without_deformation_no_shell_is_drawn(
     folder: Path, head: HeadModel, layout: PointLayout
 ) -> None:
     haired, bald = (
-        PairDataset(folder, head, layout, size=64, seed=1, samples=8, deform=deform)[3]
+        PairDataset(folder, head, layout, size=64, seed=1, samples=8, deform=deform)
         for deform in (True, False)
     )
     shell = slice(layout.surface, None)
-    assert (haired["driven"][:, shell, 0] > -2).any()
-    assert not (bald["driven"][:, shell, 0] > -2).any()
-    assert torch.equal(haired["image"], bald["image"])
+    for number in range(8):  # imagined views among them
+        with_hair, without = haired[number], bald[number]
+        assert (with_hair["driven"][:, shell, 0] > -2).any()
+        assert not (without["driven"][:, shell, 0] > -2).any()
+        assert torch.equal(with_hair["image"], without["image"])
+        assert torch.equal(with_hair["mask"], without["mask"])
+
+
+def test_a_still_often_shows_what_its_points_imagine(
+    folder: Path, head: HeadModel, layout: PointLayout
+) -> None:
+    """Views turned far whose picture lies where their points do; none without augmentation."""
+
+    def turned(**choice: Any) -> list[dict[str, torch.Tensor]]:
+        data = PairDataset(folder, head, layout, size=64, seed=2, samples=24, **choice)
+        samples = [data[number] for number in range(24)]
+        # The second view is always the still's mirror image; the first one then is not its own.
+        return [s for s in samples if not torch.allclose(s["mask"][0], s["mask"][1].flip(-1))]
+
+    assert not turned(augment=False)
+    assert not turned(whole=True)
+    found = turned()
+    assert 24 * 0.35 < len(found) < 24 * 0.85
+    for sample in found:
+        points, mask = sample["driven"][0], sample["mask"][0, 0]
+        pixel = ((points[:, :2] * 0.5 + 0.5) * 64).long()
+        inside = ((pixel >= 0) & (pixel < 64)).all(-1)
+        column, row = pixel[inside].T
+        assert (mask[row, column] > 0.5).float().mean() > 0.95
+        assert sample["valid"][0].min() == 1
 
 
 def test_the_paper_draws_what_the_portrait_cuts_off(

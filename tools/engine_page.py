@@ -30,6 +30,7 @@ from cvthead.model.config import OPEN
 from cvthead.model.cvthead import CVTHead
 from cvthead.pipeline import Pipeline
 from cvthead.points import FAR_AWAY
+from cvthead.runtime.edges import continued
 from cvthead.runtime.model_folder import WEIGHTS, packaged
 from cvthead.runtime.threads import one_thread_per_call
 from cvthead.source import Source, as_network_input, cut_head, read_source
@@ -97,7 +98,7 @@ class FloatNetwork:
         alpha = logits[0, 0].sigmoid() * 255
         pixels, mask = (x.round().to(torch.uint8).numpy() for x in (colour, alpha))
         # Beyond the points no network is asked.
-        return Frame(np.ascontiguousarray(pixels), np.minimum(mask, placed.reach))
+        return Frame.of_rgba(continued(np.dstack([pixels, np.minimum(mask, placed.reach)])))
 
 
 def compare(network: FloatNetwork, portrait: Path) -> tuple[Grid, list[float]]:

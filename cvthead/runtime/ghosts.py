@@ -31,9 +31,12 @@ def nearest_points(places: Array, seen: Mask) -> NDArray[np.int32]:
         seen: (P,) which of them the portrait sees.
 
     Returns:
-        (OWNER_PIXELS, OWNER_PIXELS) number of the nearest seen point, -1 if none is seen.
+        (OWNER_PIXELS, OWNER_PIXELS) number of the nearest seen point; -1 if none is seen, or all
+        are: the ablation that takes hidden points as seen does not know what lies in front.
     """
     size = OWNER_PIXELS
+    if seen.all():
+        return np.full((size, size), -1, np.int32)
     numbers = np.flatnonzero(seen)
     column, row = _pixels(places[numbers, 0], size), _pixels(places[numbers, 1], size)
     empty = np.ones((size, size), np.uint8)

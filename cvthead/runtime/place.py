@@ -103,7 +103,7 @@ def place(
     lost = ghosts(small, points, places, owners, covered > 0)
     refined = _refine(flow, layout, points, places, depth)
     warped = warp(portrait, flow)
-    _take_out(warped, lost, refined)
+    take_out(warped, lost, refined)
     codes = np.empty((size, size, code_size(descriptors.shape[1])), np.uint8)
     filled, codes[..., -FILL_LEVELS:] = fill(values.reshape(size, size, -1), known)
     codes[..., : filled.shape[2]] = filled
@@ -117,12 +117,14 @@ def coded(values: Array, largest: float) -> Codes:
     return np.asarray(steps + ZERO, np.uint8)
 
 
-def _take_out(warped: Codes, lost: Array, kept: NDArray[np.bool_]) -> None:
+def take_out(warped: Codes, lost: Array, kept: NDArray[np.bool_]) -> None:
     """Blend the carried portrait (2s, 2s, 4) with nobody as far as it is lost (s, s), except where
     it is surely kept (2s, 2s)."""
     if not lost.any():
         return
-    wide = cv2.morphologyEx(lost, cv2.MORPH_OPEN, SPECK)  # single pixels are errors of the grid
+    # Without single pixels, which are errors of the grid. Two steps, for MORPH_OPEN would shift
+    # the rest by a pixel.
+    wide = cv2.dilate(cv2.erode(lost, SPECK), SPECK, anchor=(0, 0))
     gone = cv2.resize(wide, warped.shape[1::-1], interpolation=cv2.INTER_LINEAR)
     gone[kept] = 0
     nobody = np.empty_like(warped)
@@ -178,8 +180,8 @@ def _votes(chosen: NDArray[np.bool_], faces: NDArray[np.int32]) -> NDArray[np.ui
 def reach_of(covered: Codes, warped: Codes) -> Codes:
     """(2s, 2s) uint8: 255 where points lie, 1 in (s, s), or the carried portrait shows the person.
 
-    Beyond the edge of a portrait nothing is known. Training pictures end there as well, so the
-    network was never told to leave it empty.
+    Beyond the edge of a portrait nothing is known. Training pictures end there as well, so but for
+    imagined views the network was never told to leave it empty.
     """
     size = warped.shape[0]
     points = cv2.resize(covered * np.uint8(255), (size, size), interpolation=cv2.INTER_LINEAR)

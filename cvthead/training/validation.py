@@ -31,7 +31,10 @@ class Validation:
 
     @torch.no_grad()
     def __call__(self, renderer: Renderer, averaged: nn.Module) -> dict[str, float]:
-        """Means over all views, which lie on white by the target's mask as in `cvthead evaluate`.
+        """Means over all views, which lie on white by the target's mask.
+
+        `cvthead evaluate` does the same with what is served, whose colours beyond the own mask are
+        not the network's (cvthead/runtime/edges.py): its figures are others.
 
         Args:
             renderer: of the network in training, which stays as it is.
