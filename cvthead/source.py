@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +21,9 @@ from cvthead.tracking.tracker import TrackedFace, Tracker
 from cvthead.visibility import eroded, on_person, visible_points
 
 Array = NDArray[np.float32]
+
+# 12 pixels to each side, as wide as loose hair. What is faintly segmented farther off is no person.
+SOFT_EDGE = np.ones((25, 25), np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +120,8 @@ def cut_head(
     camera = face.camera.in_crop(crop)
     vertices = tracker.head.vertices(face.coefficients)[tracker.head.region == Region.FACE]
     kept = person_mask(probability, valid, to_pixels(camera.project(vertices)))
-    mask = np.where(kept | (probability < 0.5), probability, 0) * valid
+    near = cv2.dilate(kept.astype(np.uint8), SOFT_EDGE) > 0
+    mask = np.where(kept | (near & (probability < 0.5)), probability, 0) * valid
     return HeadCrop(pixels, mask.astype(np.float32), valid, crop, camera, face.coefficients)
 
 

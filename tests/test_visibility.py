@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -50,6 +51,16 @@ def test_single_vertices_follow_their_neighbours(pipeline: Pipeline, layout: Poi
     # The border between the halves stays where it is, give or take a vertex.
     assert (found != clean)[: layout.surface].mean() < 0.01
     assert (found[:count] == left)[np.abs(pipeline.head.template[:, 0]) > 0.015].mean() > 0.999
+
+
+def test_nothing_faint_is_kept_far_from_the_person(pipeline: Pipeline) -> None:
+    """At the lower border of the portrait the segmentation is unsure of the ground."""
+    image = read_image(PORTRAIT)
+    crop = cut_head(pipeline.tracker, image, pipeline.tracker.track(image))
+    unsure = pipeline.tracker.networks.person_mask(crop.image)
+    away = cv2.dilate((crop.mask > 0.5).astype(np.uint8), np.ones((31, 31), np.uint8)) == 0
+    assert (unsure[away] > 0.1).any()
+    assert not crop.mask[away].any()
 
 
 def test_shell_points_have_no_neighbours(pipeline: Pipeline, layout: PointLayout) -> None:

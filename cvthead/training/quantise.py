@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import onnx
 import onnxruntime as ort
+from onnx import numpy_helper
 
 from cvthead.errors import AssetError
 from cvthead.runtime.mix import mix
@@ -53,7 +55,12 @@ def quantise(
         AssetError: it is below 40 dB.
     """
     feeds = [feed(placed) for placed in calibration]
-    network = quantise_network(source, feeds, partial(_overrides, feeds=feeds), seven_bits=True)
+    overrides = partial(_overrides, feeds=feeds)
+    network = quantise_network(source, feeds, overrides, seven_bits=True)
+    with tempfile.TemporaryDirectory() as folder:
+        corrected = Path(folder) / source.name
+        onnx.save(_corrected(onnx.load(str(source)), network, calibration), str(corrected))
+        network = quantise_network(corrected, feeds, overrides, seven_bits=True)
     onnx.save(_on_bytes(network), str(output))
     exact, small = (
         ort.InferenceSession(str(path), providers=["CPUExecutionProvider"])
@@ -72,6 +79,29 @@ def quantise(
             hint="calibrate on more pictures, or keep more layers in float",
         )
     return float(lowest)
+
+
+def _corrected(
+    exact: onnx.ModelProto, small: onnx.ModelProto, calibration: Sequence[Placed]
+) -> onnx.ModelProto:
+    """The float network, its last biases moved by the mean error of the 8-bit one.
+
+    Rounded weights err alike at every pixel, which tints the picture: nothing else of the error is
+    as large, and nothing is as easily undone. Pixels beside the person do not count.
+    """
+    sessions = [
+        ort.InferenceSession(network.SerializeToString(), providers=["CPUExecutionProvider"])
+        for network in (exact, small)
+    ]
+    errors = []
+    for placed in calibration:
+        wanted, found = (session.run(None, feed(placed))[0][0] for session in sessions)
+        errors.append((wanted - found)[placed.reach[::2, ::2] > 0])
+    last = [node for node in exact.graph.node if node.op_type == "Conv"][-1]
+    bias = next(each for each in exact.graph.initializer if each.name == last.input[2])
+    values = numpy_helper.to_array(bias) + np.concatenate(errors).mean(0)
+    bias.CopyFrom(numpy_helper.from_array(values.astype(np.float32), bias.name))
+    return exact
 
 
 def _overrides(network: onnx.ModelProto, feeds: Sequence[Feed]) -> Overrides:
