@@ -113,10 +113,13 @@ def test_drive_and_track(sdk: Client, uploaded: str) -> None:
     for picture in (rendered, follows):
         roll = sdk.track(picture.data).pose.global_rotation[2]
         assert roll == pytest.approx(tracked.pose.global_rotation[2], abs=0.08)
-    # No motion since the reference leaves the portrait as it is.
+    # No motion since the reference leaves the portrait as it is, but for points whose rounding puts
+    # them into the next pixel: a grey level here and there.
     still = pixels(sdk.drive(uploaded, tilted, reference=tilted, camera="driver").data)
     portrait_itself = pixels(sdk.preview(uploaded).data)
-    assert np.abs(still - portrait_itself).mean() < 0.1 < np.abs(driven - portrait_itself).mean()
+    change = [np.abs(picture - portrait_itself).mean() for picture in (still, driven)]
+    assert change[0] < 0.3
+    assert change[1] > 3
 
 
 def test_batch(sdk: Client, uploaded: str, tmp_path: Path) -> None:
