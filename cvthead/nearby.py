@@ -55,26 +55,27 @@ def nearby_colours(
     if not len(everything):
         return out
     image = np.ascontiguousarray(source[:3].transpose(1, 2, 0))
+    colours = sampled(image, to_pixels(points, len(image)))
     shell = np.arange(layout.surface, len(points))
     kinds = [np.flatnonzero(np.isin(layout.region, kind)) for kind in KINDS]
     for kind in (*kinds, shell):
         hidden, alike = kind[~known[kind]], kind[within[kind]]
         shown = alike if len(alike) >= NEAREST else everything
         if len(hidden):
-            out[hidden] = _mean_colours(image, points, hidden, shown)
+            out[hidden] = _mean_colours(colours, points, hidden, shown)
     return out
 
 
 def _mean_colours(
-    image: Array, points: Array, hidden: NDArray[np.intp], shown: NDArray[np.intp]
+    colours: Array, points: Array, hidden: NDArray[np.intp], shown: NDArray[np.intp]
 ) -> Array:
     """(H, 3) around the hidden points, of those that are shown."""
     count = min(NEAREST, len(shown))
     distance, number = cKDTree(points[shown]).query(points[hidden], count)
     weight = 1 / (distance.reshape(-1, count) + CLOSE)
     weight /= weight.sum(1, keepdims=True)
-    colours = sampled(image, to_pixels(points[shown], len(image)))
-    return np.asarray((colours[number.reshape(-1, count)] * weight[..., None]).sum(1), np.float32)
+    lent = colours[shown[number.reshape(-1, count)]]
+    return np.asarray((lent * weight[..., None]).sum(1), np.float32)
 
 
 def sampled(image: NDArray[Any], pixels: NDArray[np.floating]) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -74,7 +75,7 @@ class Source:
         """(P, 3) colours around the points that the portrait hides, see cvthead.nearby."""
         return nearby_colours(layout, self.network_input, self.points, self.visible)
 
-    @property
+    @cached_property
     def network_input(self) -> Array:
         """(4, 256, 256): RGB in [-1, 1], 0 outside the person, and the mask."""
         return network_input(self.head.image, self.head.mask)

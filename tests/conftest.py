@@ -13,6 +13,7 @@ import pytest
 
 from cvthead import Avatar, Pipeline
 from cvthead.images import read_image
+from cvthead.source import Source, cut_head, read_source
 
 PORTRAIT = Path(__file__).parents[1] / "examples" / "astronaut.png"
 
@@ -37,6 +38,14 @@ def pipeline() -> Pipeline:
 def avatar(pipeline: Pipeline) -> Avatar:
     """Of the sample portrait."""
     return pipeline.encode(read_image(PORTRAIT))
+
+
+@pytest.fixture(scope="session")
+def source(pipeline: Pipeline) -> Source:
+    """Of the sample portrait: what the encoder is given."""
+    image = read_image(PORTRAIT)
+    crop = cut_head(pipeline.tracker, image, pipeline.tracker.track(image))
+    return read_source(pipeline.deformer, pipeline.layout, crop)
 
 
 @pytest.fixture

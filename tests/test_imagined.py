@@ -2,27 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from cvthead import Pipeline
-from cvthead.images import read_image
 from cvthead.points import FAR_AWAY
-from cvthead.source import Source, cut_head, driven_points, read_source
+from cvthead.source import Source, driven_points
 from cvthead.training.imagined import LARGEST_YAW, NEAREST_YAW, imagined, turned
 
-PORTRAIT = Path(__file__).parents[1] / "examples" / "astronaut.png"
 SIZE = 256
-
-
-@pytest.fixture(scope="module")
-def source(pipeline: Pipeline) -> Source:
-    image = read_image(PORTRAIT)
-    crop = cut_head(pipeline.tracker, image, pipeline.tracker.track(image))
-    return read_source(pipeline.deformer, pipeline.layout, crop)
 
 
 def view(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -12,12 +10,9 @@ from numpy.typing import NDArray
 from cvthead import Pipeline
 from cvthead.head.mesh import edges
 from cvthead.head.model import Region
-from cvthead.images import read_image
 from cvthead.points import PointLayout
-from cvthead.source import cut_head, read_source
+from cvthead.source import Source
 from cvthead.visibility import agreed
-
-PORTRAIT = Path(__file__).parents[1] / "examples" / "astronaut.png"
 
 
 @pytest.fixture(scope="module")
@@ -53,10 +48,9 @@ def test_single_vertices_follow_their_neighbours(pipeline: Pipeline, layout: Poi
     assert (found[:count] == left)[np.abs(pipeline.head.template[:, 0]) > 0.015].mean() > 0.999
 
 
-def test_nothing_faint_is_kept_far_from_the_person(pipeline: Pipeline) -> None:
+def test_nothing_faint_is_kept_far_from_the_person(pipeline: Pipeline, source: Source) -> None:
     """At the lower border of the portrait the segmentation is unsure of the ground."""
-    image = read_image(PORTRAIT)
-    crop = cut_head(pipeline.tracker, image, pipeline.tracker.track(image))
+    crop = source.head
     unsure = pipeline.tracker.networks.person_mask(crop.image)
     away = cv2.dilate((crop.mask > 0.5).astype(np.uint8), np.ones((31, 31), np.uint8)) == 0
     assert (unsure[away] > 0.1).any()
@@ -69,10 +63,9 @@ def test_shell_points_have_no_neighbours(pipeline: Pipeline, layout: PointLayout
     assert (found[layout.surface :] == visible[layout.surface :]).all()
 
 
-def test_a_portrait_sees_the_face_and_not_the_back_of_the_head(pipeline: Pipeline) -> None:
-    image = read_image(PORTRAIT)
-    crop = cut_head(pipeline.tracker, image, pipeline.tracker.track(image))
-    source = read_source(pipeline.deformer, pipeline.layout, crop)
+def test_a_portrait_sees_the_face_and_not_the_back_of_the_head(
+    pipeline: Pipeline, source: Source
+) -> None:
     own = source.visible[: pipeline.layout.vertices]
     head = pipeline.head
     assert own[head.region == Region.FACE].mean() > 0.8  # lids and lips hide some

@@ -11,6 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cvthead.runtime.nearest import nearest_pixels
+
 Codes = NDArray[np.uint8]
 
 SOLID = 230  # alpha from which a colour is the person's alone
@@ -33,13 +35,8 @@ def continued(rgba: Codes) -> Codes:
     known = alpha[::2, ::2] >= SOLID
     if not known.any():
         return rgba
-    _, labels = cv2.distanceTransformWithLabels(
-        (~known).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    colours = np.ascontiguousarray(rgba[::2, ::2]).view(np.uint32)[..., 0]  # four bytes at once
-    table = np.zeros(int(labels.max()) + 1, np.uint32)
-    table[labels[known]] = colours[known]
-    nearest = table[labels][..., None].view(np.uint8)
+    colours = np.ascontiguousarray(rgba[::2, ::2]).view(np.uint32).ravel()  # four bytes at once
+    nearest = colours[nearest_pixels(known)][..., None].view(np.uint8)
     beyond = cv2.resize(nearest, rgba.shape[1::-1], interpolation=cv2.INTER_LINEAR)
     own = cv2.LUT(alpha, OWN_SHARE)
     out = cv2.blendLinear(rgba, beyond, own, 1 - own)

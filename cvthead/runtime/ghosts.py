@@ -12,6 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cvthead.runtime.nearest import nearest_pixels
+
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
@@ -35,20 +37,13 @@ def nearest_points(places: Array, seen: Mask) -> NDArray[np.int32]:
         are: the ablation that takes hidden points as seen does not know what lies in front.
     """
     size = OWNER_PIXELS
-    if seen.all():
-        return np.full((size, size), -1, np.int32)
+    point = np.full((size, size), -1, np.int32)
+    if seen.all() or not seen.any():
+        return point
     numbers = np.flatnonzero(seen)
     column, row = _pixels(places[numbers, 0], size), _pixels(places[numbers, 1], size)
-    empty = np.ones((size, size), np.uint8)
-    empty[row, column] = 0
-    if empty.all():
-        return np.full((size, size), -1, np.int32)
-    _, labels = cv2.distanceTransformWithLabels(
-        empty, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    point = np.empty(labels.max() + 1, np.int32)
-    point[labels[row, column]] = numbers
-    return np.asarray(point[labels], np.int32)
+    point[row, column] = numbers
+    return point.ravel()[nearest_pixels(point >= 0)]
 
 
 def ghosts(

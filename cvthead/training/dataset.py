@@ -37,7 +37,7 @@ from cvthead.source import (
 from cvthead.training.augmentation import UNCHANGED, colour_jitter, degraded, jittered
 from cvthead.training.details import ZOOMED, detail_weights, unseen_weights, zoom_corner
 from cvthead.training.imagined import imagined, turned
-from cvthead.training.records import Frame, Record, open_records
+from cvthead.training.records import Frame, open_records
 from cvthead.training.sampling import group_shares, turned_still
 from cvthead.visibility import inside_mask, on_person
 
@@ -143,7 +143,8 @@ class PairDataset(Dataset[dict[str, Tensor]]):
             # Nothing is imagined for the paper's network, whose points go on where the portrait
             # ends.
             if self.augment and not self.whole and rng.random() < IMAGINED_SHARE:
-                views[0] = self._imagined(rng, record, number, deformation)
+                hair = record.deformation(number)
+                views[0] = self._imagined(rng, source, visible > 0, hair, deformation)
         colours = colour_jitter(rng) if self.augment else UNCHANGED
         image, mask = source.image, source.mask
         if self.augment:
@@ -207,12 +208,15 @@ class PairDataset(Dataset[dict[str, Tensor]]):
         }
 
     def _imagined(
-        self, rng: np.random.Generator, record: Record, number: int, deformation: Deformation
+        self,
+        rng: np.random.Generator,
+        source: Frame,
+        visible: NDArray[np.bool_],
+        hair: Deformation,
+        deformation: Deformation,
     ) -> View:
         """The source turned far, by what its points show: those of the head with its hair, also
         where ``deformation`` leaves it bald."""
-        source = record.frame(number)
-        hair = record.deformation(number)
         posed, camera = turned(rng, self.head, source.coefficients, source.camera)
         start = source.coefficients, hair, source.camera
         own, far, driven = (
@@ -220,7 +224,7 @@ class PairDataset(Dataset[dict[str, Tensor]]):
             for each in (start, (posed, hair, camera), (posed, deformation, camera))
         )
         far = np.where(on_person(own, source.mask)[:, None], far, FAR_AWAY)
-        shown = record.visible(number, self.layout.total) & inside_mask(own, source.mask)
+        shown = visible & inside_mask(own, source.mask)
         image, mask = imagined(self.layout, source.image, source.mask, own, shown, far, self.size)
         return View(image, mask, np.ones_like(mask), driven)
 
