@@ -22,7 +22,7 @@ from cvthead.coefficients import EXPRESSION_SIZE, POSE_SIZE, SHAPE_SIZE, Coeffic
 from cvthead.deformation import MAX_SHELL_POINTS, Deformation
 from cvthead.files import write_file
 from cvthead.images import DAMAGE
-from cvthead.runtime.ghosts import nearest_points
+from cvthead.runtime.ghosts import point_owners
 from cvthead.runtime.place import SEEN
 
 FORMAT = "cvthead-avatar"
@@ -98,7 +98,7 @@ class Avatar:
     def owners(self) -> NDArray[np.int32]:
         """The point that each pixel of the portrait belongs to, found once; see
         cvthead.runtime.ghosts."""
-        return nearest_points(self.exact_places, self.exact_places[:, 2] == SEEN)
+        return point_owners(self.exact_places, self.exact_places[:, 2] == SEEN)
 
     def to_bytes(self) -> bytes:
         """One safetensors file of less than 1 MB."""

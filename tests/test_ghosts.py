@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from cvthead import Avatar, Controls, Pipeline
 from cvthead.driving import at_neck
 from cvthead.runtime.fill import FILL_LEVELS
-from cvthead.runtime.ghosts import OWNER_PIXELS, SURE, TOLERANCE, ghosts, nearest_points
+from cvthead.runtime.ghosts import OWNER_PIXELS, SURE, TOLERANCE, ghosts, point_owners
 from cvthead.runtime.place import place, take_out
 
 Array = NDArray[np.float32]
@@ -27,7 +27,7 @@ def places() -> Array:
 
 @pytest.fixture(scope="module")
 def owners(places: Array) -> NDArray[np.int32]:
-    return nearest_points(places, places[:, 0] < 9)
+    return point_owners(places, places[:, 0] < 9)
 
 
 def centres() -> Array:
@@ -39,7 +39,7 @@ def test_each_pixel_belongs_to_the_nearest_point_that_is_seen() -> None:
     rng = np.random.default_rng(0)
     places = rng.uniform(-1.1, 1.1, (300, 2)).astype(np.float32)
     seen = rng.random(300) < 0.5
-    owners = nearest_points(places, seen)
+    owners = point_owners(places, seen)
     assert owners.shape == (OWNER_PIXELS, OWNER_PIXELS)
     assert seen[owners].all()
     # Points beyond the border stand on it.
@@ -95,7 +95,7 @@ def test_between_kept_and_gone_it_fades(places: Array, owners: NDArray[np.int32]
 def test_of_a_portrait_that_sees_nothing_or_everything_there_are_none(
     seen: bool, places: Array
 ) -> None:
-    owners = nearest_points(places, np.full(len(places), seen))
+    owners = point_owners(places, np.full(len(places), seen))
     assert (owners == -1).all()
     flow = np.ones((SIZE, SIZE, 2), np.float32)
     assert not ghosts(flow, places, places, owners, np.ones((SIZE, SIZE), np.bool_)).any()

@@ -7,7 +7,7 @@ import pytest
 
 from cvthead import Avatar, Pipeline
 from cvthead.head.model import Region
-from cvthead.runtime.ghosts import nearest_points
+from cvthead.runtime.ghosts import point_owners
 from cvthead.runtime.place import SEEN, SEEN_MIRRORED, place
 from cvthead.runtime.triangles import FAR, rasterise
 from cvthead.runtime.warp import dense_flow, warp
@@ -104,7 +104,7 @@ def test_hidden_half_comes_from_the_other_side(pipeline: Pipeline, avatar: Avata
     shown = []
     for seen in (SEEN_MIRRORED, 0.0):
         rows[left, 2] = seen
-        owners = nearest_points(rows, rows[:, 2] == SEEN)
+        owners = point_owners(rows, rows[:, 2] == SEEN)
         warped = place(layout, points, rows, owners, avatar.descriptors, portrait, 128).warped
         shown.append(float(warped[part].mean()))
     assert shown[0] > 60

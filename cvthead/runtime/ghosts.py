@@ -25,7 +25,7 @@ TOLERANCE, TOLERANCE_OUTSIDE = 0.07, 0.03
 SURE = 1.5
 
 
-def nearest_points(places: Array, seen: Mask) -> NDArray[np.int32]:
+def point_owners(places: Array, seen: Mask) -> NDArray[np.int32]:
     """The point that each pixel of the portrait belongs to; depends on the portrait alone.
 
     Args:
@@ -54,7 +54,7 @@ def ghosts(
     Args:
         flow: (s, s, 2) from each pixel of the frame to the portrait, normalised.
         points: (P, 3) normalised driven projections.
-        places: (P, 2+) as for :func:`nearest_points`.
+        places: (P, 2+) as for :func:`point_owners`.
         owners: from there.
         covered: (s, s) where points lie.
 

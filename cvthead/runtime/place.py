@@ -72,7 +72,7 @@ def place(
         layout: numbering of the points.
         points: (P, 3) normalised driven projections.
         places: (P, 3) each point's x and y in the portrait and how it is seen.
-        owners: of cvthead.runtime.ghosts.nearest_points.
+        owners: of cvthead.runtime.ghosts.point_owners.
         descriptors: (P, C) codes; C may be 0.
         portrait: (256, 256, 4), see Avatar.
         size: of the splat, half of the frame's.

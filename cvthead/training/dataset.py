@@ -25,7 +25,7 @@ from cvthead.head.model import HeadModel
 from cvthead.model.config import OPEN
 from cvthead.nearby import nearby_colours
 from cvthead.points import FAR_AWAY, PointLayout
-from cvthead.runtime.ghosts import nearest_points
+from cvthead.runtime.ghosts import point_owners
 from cvthead.runtime.place import SEEN, Placed, place
 from cvthead.source import (
     as_network_input,
@@ -232,7 +232,7 @@ class PairDataset(Dataset[dict[str, Tensor]]):
         """The portrait carried to the driven points."""
         splat_size = self.size // OPEN.unet_unshuffle
         nothing = np.empty((len(driven), 0), np.uint8)
-        owners = nearest_points(at, at[:, 2] == SEEN)
+        owners = point_owners(at, at[:, 2] == SEEN)
         return place(self.layout, driven, at, owners, nothing, portrait, splat_size)
 
 

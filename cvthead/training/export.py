@@ -33,7 +33,7 @@ from cvthead.model.config import OPEN
 from cvthead.model.cvthead import CVTHead
 from cvthead.model.light_unet import PIXEL_SIZE, PORTRAIT_SIZE
 from cvthead.points import PointLayout
-from cvthead.runtime.ghosts import nearest_points
+from cvthead.runtime.ghosts import point_owners
 from cvthead.runtime.mix import LOGIT_RANGE
 from cvthead.runtime.model_folder import DESCRIBE, PAINT, WEIGHTS, write_record
 from cvthead.runtime.networks import DESCRIBE_INPUTS
@@ -126,7 +126,7 @@ def frames(
     for sample in calibration:
         codes = session.run(None, {name: sample[name][None] for name in DESCRIBE_INPUTS})[0][0]
         at = places(layout, sample["points"], sample["visible"] > 0)
-        owners = nearest_points(at, at[:, 2] == SEEN)
+        owners = point_owners(at, at[:, 2] == SEEN)
         portrait = portrait_pixels(sample["source"])
         out.append(place(layout, sample["driven"][0], at, owners, codes, portrait, SPLAT_SIZE))
     return out

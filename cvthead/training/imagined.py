@@ -20,7 +20,7 @@ from cvthead.head.model import HeadModel
 from cvthead.nearby import nearby_colours, sampled
 from cvthead.points import PointLayout
 from cvthead.runtime.fill import ZERO
-from cvthead.runtime.ghosts import nearest_points
+from cvthead.runtime.ghosts import point_owners
 from cvthead.runtime.place import SEEN, SOFT_EDGE, coded, place
 from cvthead.source import network_input, places, portrait_pixels
 
@@ -93,7 +93,7 @@ def imagined(
         layout,
         points,
         at,
-        nearest_points(at, visible),
+        point_owners(at, visible),
         coded(colours, 1),
         portrait_pixels(network),
         size // 2,
