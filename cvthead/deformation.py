@@ -27,6 +27,7 @@ from cvthead.silhouette import Mask, Points, distance_to_points, pixel_of, signe
 Array = NDArray[np.float32]
 
 MAX_EAR_OFFSET = 0.005  # metres
+HAIR_FORWARD = 0.01  # metres
 MAX_SHELL_POINTS = 512
 # Pixels of the 256 x 256 crop, which spans 0.36 m.
 SHELL_SPACING = 4.5
@@ -151,8 +152,11 @@ class DeformationModel:
         # The back of the scalp moves back by as much as the scalp moves in the picture on
         # average, so that hair keeps a volume when the head turns.
         scalp = head.region == Region.SCALP
-        volume = np.linalg.norm(view[scalp], axis=1).mean()
-        view[:, 2] = np.where(scalp, np.minimum(normals[:, 2], 0) * volume, 0)
+        thickness = np.linalg.norm(view, axis=1)
+        back = np.minimum(normals[:, 2], 0) * thickness[scalp].mean()
+        # Hair at the sides and above the forehead lies in front of the scalp it grows from.
+        front = np.minimum(thickness, HAIR_FORWARD) * np.clip(1 + 2 * normals[:, 2], 0, 1)
+        view[:, 2] = np.where(scalp, back + front, 0)
 
         unposed = inverse_rotations(head, coefficients)
         offsets = np.einsum("nij,nj->ni", unposed, view)

@@ -149,10 +149,11 @@ def build(data: MakeHuman) -> dict[str, NDArray[np.generic]]:
 
     marker = mesh.groups["joint-mouth"]
     jaw_marker = scale * mesh.vertices[np.unique([v for vs, _ in marker for v in vs])].mean(0)
-    root, skull = sampled.markers["joint-neck"], sampled.markers["joint-head"]
     targets = {
-        0: root,
-        1: (root + skull) / 2,
+        0: sampled.markers["joint-neck"],
+        # Heads turn and nod on the topmost vertebrae, so less of the neck and the shoulders moves
+        # with them than if they did in the middle of the neck.
+        1: sampled.markers["joint-head"],
         2: sampled.markers["joint-mouth"] + (jaw.pivot - jaw_marker) * [0, 1, 1],
     }
     samples = np.stack([surface.matrix @ s for s in sampled.vertices]).astype(np.float32)

@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 CANDIDATES = 2500
 # How strongly a joint may follow identity samples against how still it keeps in expressions.
 STILLNESS = 30.0
-# Share of the mean vertex variance; keeps single weights under about 0.1.
+# Share of the mean vertex variance; keeps single weights under about 0.25.
 RIDGE = 3e-3
 
 

@@ -46,16 +46,13 @@ def point_owners(places: Array, seen: Mask) -> NDArray[np.int32]:
     return point.ravel()[nearest_pixels(point >= 0)]
 
 
-def ghosts(
-    flow: Array, points: Array, places: Array, owners: NDArray[np.int32], covered: Mask
-) -> Array:
+def ghosts(flow: Array, towards: Array, owners: NDArray[np.int32], covered: Mask) -> Array:
     """How surely each pixel's piece of the portrait has moved elsewhere.
 
     Args:
         flow: (s, s, 2) from each pixel of the frame to the portrait, normalised.
-        points: (P, 3) normalised driven projections.
-        places: (P, 2+) as for :func:`point_owners`.
-        owners: from there.
+        towards: (P, 2+) from each driven point to its place in the portrait, normalised.
+        owners: of :func:`point_owners`.
         covered: (s, s) where points lie.
 
     Returns:
@@ -63,18 +60,17 @@ def ghosts(
     """
     if owners[0, 0] < 0:
         return np.zeros(flow.shape[:2], np.float32)
-    way = points[:, :2] - places[:, :2]
-    moved = way.take(owners.ravel(), axis=0).reshape(*owners.shape, 2)
+    asked = towards.take(owners.ravel(), axis=0).reshape(*owners.shape, -1)
     # Normalised -> pixel index of the portrait: centre of the first pixel is 0 for OpenCV.
     size, side = len(flow), len(owners)
     line = (np.arange(size, dtype=np.float32) + np.float32(0.5)) * np.float32(side / size)
     there = flow * np.float32(side / 2)
     there[..., 0] += line - np.float32(0.5)
     there[..., 1] += (line - np.float32(0.5))[:, None]
-    back = cv2.remap(  # type: ignore[call-overload]
-        moved, there, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE
+    meant = cv2.remap(  # type: ignore[call-overload]
+        asked, there, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE
     )
-    x, y = cv2.split(cv2.add(back, flow))
+    x, y = (cv2.subtract(*pair) for pair in zip(cv2.split(flow), cv2.split(meant), strict=False))
     strict = np.where(covered, np.float32(TOLERANCE**-2), np.float32(TOLERANCE_OUTSIDE**-2))
     beyond = (x * x + y * y) * strict - np.float32(1)
     return np.asarray((beyond * np.float32(1 / (SURE**2 - 1))).clip(0, 1), np.float32)
