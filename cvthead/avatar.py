@@ -24,6 +24,7 @@ from cvthead.files import write_file
 from cvthead.images import DAMAGE
 from cvthead.runtime.ghosts import point_owners
 from cvthead.runtime.place import SEEN
+from cvthead.runtime.seams import outline_rim
 
 FORMAT = "cvthead-avatar"
 VERSION = "3"
@@ -99,6 +100,11 @@ class Avatar:
         """The point that each pixel of the portrait belongs to, found once; see
         cvthead.runtime.ghosts."""
         return point_owners(self.exact_places, self.exact_places[:, 2] == SEEN)
+
+    @cached_property
+    def rim(self) -> NDArray[np.float32]:
+        """Where the portrait is mixed with what was behind it; see cvthead.runtime.seams."""
+        return outline_rim(self.portrait)
 
     def to_bytes(self) -> bytes:
         """One safetensors file of less than 1 MB."""

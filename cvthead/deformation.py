@@ -152,10 +152,10 @@ class DeformationModel:
         # The back of the scalp moves back by as much as the scalp moves in the picture on
         # average, so that hair keeps a volume when the head turns.
         scalp = head.region == Region.SCALP
-        thickness = np.linalg.norm(view, axis=1)
-        back = np.minimum(normals[:, 2], 0) * thickness[scalp].mean()
+        back = np.minimum(normals[:, 2], 0) * np.linalg.norm(view[scalp], axis=1).mean()
         # Hair at the sides and above the forehead lies in front of the scalp it grows from.
-        front = np.minimum(thickness, HAIR_FORWARD) * np.clip(1 + 2 * normals[:, 2], 0, 1)
+        thickness = (view * normals).sum(axis=1).clip(0, HAIR_FORWARD)
+        front = thickness * np.clip(1 + 2 * normals[:, 2], 0, 1)
         view[:, 2] = np.where(scalp, back + front, 0)
 
         unposed = inverse_rotations(head, coefficients)

@@ -1,4 +1,4 @@
-"""A first guess at the colour of what the portrait hides: that of the nearest points it shows."""
+"""The colour of what the portrait hides: that of the nearest points it shows."""
 
 from __future__ import annotations
 

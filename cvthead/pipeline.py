@@ -193,6 +193,7 @@ class Pipeline:
             points,
             avatar.exact_places,
             avatar.owners,
+            avatar.rim,
             avatar.descriptors,
             avatar.portrait,
             self.networks.splat_size,

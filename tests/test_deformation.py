@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from cvthead.camera import CROP_PIXELS, Camera
 from cvthead.coefficients import Coefficients
 from cvthead.deformation import (
+    HAIR_FORWARD,
     MAX_EAR_OFFSET,
     MAX_SHELL_POINTS,
     SHELL_SPACING,
@@ -25,6 +26,7 @@ from cvthead.deformation import (
 from cvthead.errors import FaceError
 from cvthead.evaluation.deformation import measure
 from cvthead.evaluation.tracking import read_image
+from cvthead.head.mesh import vertex_normals
 from cvthead.head.model import HeadModel, Region
 from cvthead.silhouette import distance_to_points, overlap, person_mask, rasterise
 from cvthead.source import cut_head
@@ -120,6 +122,19 @@ def test_shell_has_the_depth_of_its_anchor(
     positions = points(head, posed, fitted)
     shell = positions[len(head.template) :, 2]
     np.testing.assert_allclose(shell, positions[fitted.shell_anchor, 2], atol=1e-4)
+
+
+def test_hair_lies_in_front_of_the_scalp_it_grows_from(
+    head: HeadModel, posed: Coefficients, fitted: Deformation
+) -> None:
+    bald = head.vertices(posed)
+    nearer = (points(head, posed, fitted)[: len(bald)] - bald)[:, 2]
+    normals = vertex_normals(bald, head.faces)
+    scalp = head.region == Region.SCALP
+    before = scalp & (normals[:, 2] > 0)
+    assert nearer[before].min() > -1e-4
+    assert 0.005 < nearer[before].max() < HAIR_FORWARD + 1e-4
+    assert nearer[scalp & (normals[:, 2] < -0.5)].max() < 1e-4  # at the back it goes back
 
 
 def test_hair_turns_rigidly_with_the_head(

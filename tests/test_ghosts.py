@@ -101,19 +101,31 @@ def test_of_a_portrait_that_sees_nothing_or_everything_there_are_none(
     assert not ghosts(flow, np.zeros_like(places), owners, np.ones((SIZE, SIZE), np.bool_)).any()
 
 
-def test_a_block_is_taken_out_where_it_is_and_a_single_pixel_is_not() -> None:
+def test_a_block_is_a_ghost_where_it_is_and_a_single_pixel_is_not(
+    places: Array, owners: NDArray[np.int32]
+) -> None:
+    flow = np.zeros((SIZE, SIZE, 2), np.float32)
+    flow[40:60, 70:90] = flow[10, 10] = 0.3
+    found = ghosts(flow, np.zeros_like(places), owners, np.ones((SIZE, SIZE), np.bool_))
+    assert (found[40:60, 70:90] == 1).all()
+    assert found.sum() == 20 * 20
+
+
+def test_a_block_is_taken_out_where_it_is() -> None:
     lost = np.zeros((SIZE, SIZE), np.float32)
     lost[40:60, 70:90] = 1
-    lost[10, 10] = 1
     warped = np.full((2 * SIZE, 2 * SIZE, 4), 200, np.uint8)
     kept = np.zeros((2 * SIZE, 2 * SIZE), np.bool_)
     kept[80:100] = True
-    take_out(warped, lost, kept)
+    seam = np.zeros_like(lost)
+    seam[45:50, 80:90] = 1
+    take_out(warped, lost, seam, kept)
     gone = warped[..., 3] < 100
     assert gone[100:120, 140:180].all()
-    assert gone.sum() == 20 * 40
+    assert gone[100:].sum() == 20 * 40
     assert tuple(warped[110, 150]) == (128, 128, 128, 0)
-    assert (warped[80:100] == 200).all()
+    assert gone[90:100, 160:180].all()  # a seam, even where no ghost may be
+    assert (warped[80:100, :158] == 200).all()
 
 
 def test_a_turned_head_has_no_second_outline(pipeline: Pipeline, avatar: Avatar) -> None:
@@ -129,6 +141,7 @@ def test_a_turned_head_has_no_second_outline(pipeline: Pipeline, avatar: Avatar)
                 points,
                 avatar.exact_places,
                 owners,
+                avatar.rim,
                 avatar.descriptors,
                 avatar.portrait,
                 SIZE,

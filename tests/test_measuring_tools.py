@@ -1,11 +1,13 @@
 """tools/latency_plot.py and tools/footprint.py: what they print, not how fast it is; and
-tools/st_lpips_parts.py: that what it replaces or moves lies nearer to the target."""
+tools/st_lpips_parts.py: that what it replaces or moves lies nearer to the target; and
+tools/depth_errors.py: that it finds the depth by which a head was made too flat."""
 
 from __future__ import annotations
 
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -13,10 +15,14 @@ import numpy as np
 import pytest
 
 from cvthead import Pipeline
+from cvthead.avatar import Avatar
+from cvthead.driving import at_neck
 from cvthead.evaluation.methods import Drawn
 from cvthead.evaluation.shots import Shot, shoot
+from cvthead.head.model import Region
 from cvthead.images import read_image
 from cvthead.sample import SAMPLE
+from tools.depth_errors import residuals
 from tools.footprint import base_dependencies, resident_bytes, service_lines
 from tools.latency_plot import measure, plot, table
 from tools.st_lpips_parts import pictures, regions
@@ -104,3 +110,22 @@ def test_parts_replaced_or_moved_lie_nearer_to_the_target(pipeline: Pipeline, sh
     assert max(replaced) < off["the result"]
     blurred = [value for name, value in off.items() if name.startswith("the target")]
     assert 0 < blurred[0] < blurred[1] < blurred[2]
+
+
+def test_a_part_that_lies_too_deep_asks_to_be_nearer(pipeline: Pipeline, avatar: Avatar) -> None:
+    """An avatar drives another whose scalp was moved backwards."""
+    scalp = pipeline.head.region == Region.SCALP
+    offsets = avatar.deformation.offsets - np.array([0, 0, 0.03], np.float32) * scalp[:, None]
+    flat = replace(avatar, deformation=replace(avatar.deformation, offsets=offsets))
+    found = []
+    for yaw in (-0.3, 0.3):
+        wanted = avatar.coefficients.with_joints({"global": (0, yaw, 0)})
+        wanted, camera = at_neck(pipeline.head, avatar.coefficients, wanted, avatar.camera)
+        shown = pipeline.render_coefficients(avatar, wanted, camera).over((255, 255, 255))
+        driver = shoot(pipeline.tracker, "turned", 0, shown)
+        assert driver is not None
+        for part, nearer, beside in residuals(pipeline, flat, driver):
+            if part == "SCALP":
+                found.append((nearer[0], beside[0]))
+    across, beside = np.array(found).T
+    assert 0.01 < (across * beside).sum() / (across**2).sum() < 0.05  # metres

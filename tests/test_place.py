@@ -105,7 +105,8 @@ def test_hidden_half_comes_from_the_other_side(pipeline: Pipeline, avatar: Avata
     for seen in (SEEN_MIRRORED, 0.0):
         rows[left, 2] = seen
         owners = point_owners(rows, rows[:, 2] == SEEN)
-        warped = place(layout, points, rows, owners, avatar.descriptors, portrait, 128).warped
+        codes = avatar.descriptors
+        warped = place(layout, points, rows, owners, avatar.rim, codes, portrait, 128).warped
         shown.append(float(warped[part].mean()))
     assert shown[0] > 60
     assert shown[1] < 5

@@ -151,8 +151,7 @@ def build(data: MakeHuman) -> dict[str, NDArray[np.generic]]:
     jaw_marker = scale * mesh.vertices[np.unique([v for vs, _ in marker for v in vs])].mean(0)
     targets = {
         0: sampled.markers["joint-neck"],
-        # Heads turn and nod on the topmost vertebrae, so less of the neck and the shoulders moves
-        # with them than if they did in the middle of the neck.
+        # Heads turn and nod on the topmost vertebrae.
         1: sampled.markers["joint-head"],
         2: sampled.markers["joint-mouth"] + (jaw.pivot - jaw_marker) * [0, 1, 1],
     }

@@ -49,7 +49,12 @@ def bone_fields(data: MakeHuman, ids: NDArray[np.int64]) -> BoneFields:
 
 
 def linear_blend_weights(head: Floats, jaw: Floats, part: NDArray[np.int64]) -> Floats:
-    """(B, 5) weights of root, neck, jaw, left eye, right eye; rows sum to 1."""
+    """(B, 5) weights of root, neck, jaw, left eye, right eye; rows sum to 1.
+
+    MakeHuman's neck bends evenly along its bones. Ours has one joint, at the top: the lower a
+    vertex lies, the less it may follow, or the throat swings out behind the chin.
+    """
+    head = head**3 * (3 - 2 * head)
     weights = np.zeros((len(part), 5))
     weights[:, 3] = part == Part.LEFT_EYE
     weights[:, 4] = part == Part.RIGHT_EYE

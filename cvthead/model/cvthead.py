@@ -69,12 +69,13 @@ class CVTHead(nn.Module):
             points: (b, p, 3) normalised source projections: vertices, midpoints, shell.
             visible: (b, p) 1 where the source sees the point.
             anchor: (b, shell) vertex that each shell point hangs on.
-            nearby: (b, p, 3) of cvthead.nearby.
+            nearby: (b, p, 3) of cvthead.nearby; not used by the transformer alone.
 
         Returns:
             (b, p, C) float32.
         """
         tokens, pixels = self.encoder(source)
+        hidden: Tensor | None = nearby
         if self.config.features == "pixel-aligned":
             size = self.config.upsampler_sizes[-1]
             vertex = points.new_zeros(len(points), self.fusion.vertex_embedding.shape[0], size)
@@ -84,7 +85,7 @@ class CVTHead(nn.Module):
             x = self.transformer(x)[:, : len(self.coarse)]
             vertex = self.upsampler(x)  # b n f
             if self.config.features == "transformer":
-                visible, nearby = torch.zeros_like(visible), torch.zeros_like(nearby)
+                visible, hidden = torch.zeros_like(visible), None
         embedding = self.fusion.vertex_embedding.expand(len(source), -1, -1)
         feature = self._spread(vertex, anchor)
         embedding = self._spread(embedding, anchor)
@@ -92,7 +93,7 @@ class CVTHead(nn.Module):
         shell = torch.arange(len(self.mirror), points.shape[1], device=self.mirror.device)
         mirror = torch.cat([self.mirror, shell])
         out: Tensor = self.fusion(
-            feature, embedding, pixels.float(), source, points, visible, mirror, nearby
+            feature, embedding, pixels.float(), source, points, visible, mirror, hidden
         )
         return out
 

@@ -3,7 +3,7 @@
 The paper argues (section 3.3) that features sampled at a vertex's projection are sharp where
 the vertex is visible and wrong where it is not. So they are gated by visibility; hidden points
 see their mirrored counterpart when that is visible, and the transformer's feature always. Where
-neither is, the colour is that of the nearest visible points, and what the network adds to it.
+neither is, the colour is that of the nearest visible points.
 The first three descriptor channels are the point's colour in [-1, 1].
 """
 
@@ -44,7 +44,7 @@ class PixelAlignedFusion(nn.Module):
         points: Tensor,
         visible: Tensor,
         mirror: Tensor,
-        nearby: Tensor,
+        nearby: Tensor | None,
     ) -> Tensor:
         """Descriptors of all points.
 
@@ -56,7 +56,8 @@ class PixelAlignedFusion(nn.Module):
             points: (b, p, 3) source projections.
             visible: (b, p) 1 where the source sees the point, else 0.
             mirror: (p,) the point's mirrored counterpart.
-            nearby: (b, p, 3) colour where neither is visible, see cvthead.nearby.
+            nearby: (b, p, 3) colour where neither is visible, see cvthead.nearby; None lets the
+                network guess it.
 
         Returns:
             (b, p, size): colour, then learned channels.
@@ -70,7 +71,9 @@ class PixelAlignedFusion(nn.Module):
         inputs = [features, aligned, colour, mirrored_colour, own, other, embedding]
         out = self.head(torch.cat([x.float() for x in inputs], dim=-1))
         known = own + other
-        guess = (nearby + torch.tanh(out[..., :COLOUR_SIZE].float())).clamp(-1, 1)
-        painted = colour + mirrored_colour + (1 - known) * guess
+        # Not a guess on top of what lies nearby: that learnt to mark hidden points with green. (The
+        # layer's first three rows serve the transformer alone, which is told of nothing nearby.)
+        hidden = torch.tanh(out[..., :COLOUR_SIZE].float()) if nearby is None else nearby
+        painted = colour + mirrored_colour + (1 - known) * hidden
         learned = out[..., COLOUR_SIZE:].float()
         return torch.cat([painted, learned], dim=-1)

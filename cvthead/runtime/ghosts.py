@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvthead.runtime.nearest import nearest_pixels
+from cvthead.runtime.warp import reading_place
 
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -23,6 +24,7 @@ OWNER_PIXELS = 128  # of the portrait's side: finer than the points lie
 # gone altogether; in between it fades, or it would flicker in motion.
 TOLERANCE, TOLERANCE_OUTSIDE = 0.07, 0.03
 SURE = 1.5
+SPECK = np.ones((2, 2), np.uint8)  # single pixels are errors of the grid
 
 
 def point_owners(places: Array, seen: Mask) -> NDArray[np.int32]:
@@ -61,19 +63,20 @@ def ghosts(flow: Array, towards: Array, owners: NDArray[np.int32], covered: Mask
     if owners[0, 0] < 0:
         return np.zeros(flow.shape[:2], np.float32)
     asked = towards.take(owners.ravel(), axis=0).reshape(*owners.shape, -1)
-    # Normalised -> pixel index of the portrait: centre of the first pixel is 0 for OpenCV.
-    size, side = len(flow), len(owners)
-    line = (np.arange(size, dtype=np.float32) + np.float32(0.5)) * np.float32(side / size)
-    there = flow * np.float32(side / 2)
-    there[..., 0] += line - np.float32(0.5)
-    there[..., 1] += (line - np.float32(0.5))[:, None]
     meant = cv2.remap(  # type: ignore[call-overload]
-        asked, there, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE
+        asked,
+        reading_place(flow, len(owners)),
+        None,
+        cv2.INTER_NEAREST,
+        borderMode=cv2.BORDER_REPLICATE,
     )
+    # Further columns of ``towards`` are carried along, for to cut them off would cost more.
     x, y = (cv2.subtract(*pair) for pair in zip(cv2.split(flow), cv2.split(meant), strict=False))
     strict = np.where(covered, np.float32(TOLERANCE**-2), np.float32(TOLERANCE_OUTSIDE**-2))
     beyond = (x * x + y * y) * strict - np.float32(1)
-    return np.asarray((beyond * np.float32(1 / (SURE**2 - 1))).clip(0, 1), np.float32)
+    lost = (beyond * np.float32(1 / (SURE**2 - 1))).clip(0, 1)
+    # Two steps, for MORPH_OPEN would shift the rest by a pixel.
+    return np.asarray(cv2.dilate(cv2.erode(lost, SPECK), SPECK, anchor=(0, 0)), np.float32)
 
 
 def _pixels(coordinates: Array, size: int) -> NDArray[np.intp]:

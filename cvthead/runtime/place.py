@@ -5,7 +5,8 @@ shows it, so the splat also gives a flow from the driven frame back to the portr
 it, the portrait is a sharp first guess of everything the source saw. The face, whose lids, irises
 and lips move by less than a pixel of the splat, gets its flow from its triangles at full
 resolution. What of it the portrait hides is taken from the other side, if that is seen. What shows
-a second time where it no longer is (cvthead/runtime/ghosts.py) is taken out.
+a second time where it no longer is (cvthead/runtime/ghosts.py) is taken out, and so is the
+portrait's outline where it has come to lie within the person (cvthead/runtime/seams.py).
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from cvthead.points import PointLayout
 from cvthead.runtime.fill import FILL_LEVELS, ZERO, fill
 from cvthead.runtime.ghosts import ghosts
+from cvthead.runtime.seams import seams
 from cvthead.runtime.splat import EMPTY_DEPTH, splat
 from cvthead.runtime.triangles import FAR, rasterise
 from cvthead.runtime.warp import dense_flow, warp
@@ -31,7 +33,6 @@ DEPTH_RANGE = 1.5  # normalised depths of a head in its crop lie well within -1.
 CODE_STEPS = 127  # codes of a range on either side of ZERO
 CLOSING = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9))  # closes gaps between points
 SOFT_EDGE = np.ones((3, 3), np.uint8)
-SPECK = np.ones((2, 2), np.uint8)
 # Of the portrait, where it shows no person; four bytes at once.
 NOBODY = np.array([ZERO, ZERO, ZERO, 0], np.uint8).view(np.uint32)
 BEHIND = 0.06  # normalised depth, about 10 mm: further back a triangle lies behind the splat
@@ -63,6 +64,7 @@ def place(
     points: Array,
     places: Array,
     owners: NDArray[np.int32],
+    rim: Array,
     descriptors: Codes,
     portrait: Codes,
     size: int,
@@ -74,6 +76,7 @@ def place(
         points: (P, 3) normalised driven projections.
         places: (P, 3) each point's x and y in the portrait and how it is seen.
         owners: of cvthead.runtime.ghosts.point_owners.
+        rim: of cvthead.runtime.seams.outline_rim.
         descriptors: (P, C) codes; C may be 0.
         portrait: (256, 256, 4), see Avatar.
         size: of the splat, half of the frame's.
@@ -101,10 +104,11 @@ def place(
     covered: Codes = np.asarray(
         cv2.morphologyEx(known.view(np.uint8), cv2.MORPH_CLOSE, CLOSING), np.uint8
     )
-    lost = ghosts(small, towards, owners, covered > 0)
+    ghost = ghosts(small, towards, owners, covered > 0)
+    seam = seams(small, rim, covered)
     refined = _refine(flow, layout, points, places, depth)
     warped = warp(portrait, flow)
-    take_out(warped, lost, refined)
+    take_out(warped, ghost, seam, refined)
     codes = np.empty((size, size, code_size(descriptors.shape[1])), np.uint8)
     filled, codes[..., -FILL_LEVELS:] = fill(values.reshape(size, size, -1), known)
     codes[..., : filled.shape[2]] = filled
@@ -118,15 +122,14 @@ def coded(values: Array, largest: float) -> Codes:
     return np.asarray(steps + ZERO, np.uint8)
 
 
-def take_out(warped: Codes, lost: Array, kept: NDArray[np.bool_]) -> None:
-    """Blend the carried portrait (2s, 2s, 4) with nobody as far as it is lost (s, s), except where
-    it is surely kept (2s, 2s)."""
-    if not lost.any():
+def take_out(warped: Codes, ghost: Array, seam: Array, kept: NDArray[np.bool_]) -> None:
+    """Blend the carried portrait (2s, 2s, 4) with nobody as far as a ghost or a seam (s, s) says;
+    what is surely kept (2s, 2s) is no ghost."""
+    if not (ghost.any() or seam.any()):
         return
-    # Without single pixels, which are errors of the grid. Two steps, for MORPH_OPEN would shift
-    # the rest by a pixel.
-    wide = cv2.dilate(cv2.erode(lost, SPECK), SPECK, anchor=(0, 0))
-    gone = cv2.resize(wide, warped.shape[1::-1], interpolation=cv2.INTER_LINEAR) * ~kept
+    sides = warped.shape[1::-1]
+    gone = cv2.resize(ghost, sides, interpolation=cv2.INTER_LINEAR) * ~kept
+    gone = np.maximum(gone, cv2.resize(seam, sides, interpolation=cv2.INTER_LINEAR))
     nobody = np.full(warped.shape[:2], NOBODY).view(np.uint8).reshape(warped.shape)
     cv2.blendLinear(warped, nobody, 1 - gone, gone, warped)
 

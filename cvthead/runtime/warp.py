@@ -45,14 +45,20 @@ def _means(sums: Array) -> Array:
     return np.asarray(cv2.merge([x / share, y / share, some]))
 
 
-def warp(portrait: NDArray[np.uint8], flow: Array) -> NDArray[np.uint8]:
-    """Portrait (s, s, 4) read at pixel centre + flow (size, size, 2), bilinear."""
-    side, size = portrait.shape[0], flow.shape[0]
-    # Normalised -> pixel index: centre of the first pixel is 0 for OpenCV.
+def reading_place(flow: Array, side: int) -> Array:
+    """Where each pixel reads the portrait: flow (s, s, 2), normalised -> (s, s, 2) x and y as
+    OpenCV counts pixels of a portrait of that side, the centre of the first being 0."""
+    size = flow.shape[0]
     line = (np.arange(size, dtype=np.float32) + 0.5) * np.float32(side / size) - np.float32(0.5)
     place = flow * np.float32(side / 2)
     place[..., 0] += line
     place[..., 1] += line[:, None]
+    return place
+
+
+def warp(portrait: NDArray[np.uint8], flow: Array) -> NDArray[np.uint8]:
+    """Portrait (s, s, 4) read at pixel centre + flow (size, size, 2), bilinear."""
+    place = reading_place(flow, portrait.shape[0])
     out = cv2.remap(  # type: ignore[call-overload]
         portrait, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )

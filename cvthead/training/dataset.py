@@ -27,6 +27,7 @@ from cvthead.nearby import nearby_colours
 from cvthead.points import FAR_AWAY, PointLayout
 from cvthead.runtime.ghosts import point_owners
 from cvthead.runtime.place import SEEN, Placed, place
+from cvthead.runtime.seams import outline_rim
 from cvthead.source import (
     as_network_input,
     driven_points,
@@ -169,12 +170,15 @@ class PairDataset(Dataset[dict[str, Tensor]]):
         driven = [np.where(drawn[:, None], v.points, FAR_AWAY) for v in views]
         landmarks = [self.head.landmarks(v.points[: self.layout.vertices]) for v in views]
         portrait = portrait_pixels(network)
+        rim = outline_rim(portrait)
         zoomed = int(rng.integers(len(ZOOMED)))
 
         def carried() -> tuple[list[Array], list[Placed]]:
             at = places(self.layout, own, visible > 0)
             ats = [at if v.carries_shell else without_shell(at, self.layout) for v in views]
-            return ats, [self._placed(d, its, portrait) for d, its in zip(driven, ats, strict=True)]
+            return ats, [
+                self._placed(d, its, rim, portrait) for d, its in zip(driven, ats, strict=True)
+            ]
 
         ats, placed = carried()
         weights = [
@@ -228,12 +232,12 @@ class PairDataset(Dataset[dict[str, Tensor]]):
         image, mask = imagined(self.layout, source.image, source.mask, own, shown, far, self.size)
         return View(image, mask, np.ones_like(mask), driven)
 
-    def _placed(self, driven: Array, at: Array, portrait: NDArray[np.uint8]) -> Placed:
+    def _placed(self, driven: Array, at: Array, rim: Array, portrait: NDArray[np.uint8]) -> Placed:
         """The portrait carried to the driven points."""
         splat_size = self.size // OPEN.unet_unshuffle
         nothing = np.empty((len(driven), 0), np.uint8)
         owners = point_owners(at, at[:, 2] == SEEN)
-        return place(self.layout, driven, at, owners, nothing, portrait, splat_size)
+        return place(self.layout, driven, at, owners, rim, nothing, portrait, splat_size)
 
 
 def targets(views: Sequence[View], size: int) -> dict[str, Array]:

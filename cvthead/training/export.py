@@ -38,6 +38,7 @@ from cvthead.runtime.mix import LOGIT_RANGE
 from cvthead.runtime.model_folder import DESCRIBE, PAINT, WEIGHTS, write_record
 from cvthead.runtime.networks import DESCRIBE_INPUTS
 from cvthead.runtime.place import SEEN, Placed, place
+from cvthead.runtime.seams import outline_rim
 from cvthead.source import places, portrait_pixels
 from cvthead.training.checkpoint import averaged, read
 from cvthead.training.dataset import PairDataset
@@ -128,7 +129,8 @@ def frames(
         at = places(layout, sample["points"], sample["visible"] > 0)
         owners = point_owners(at, at[:, 2] == SEEN)
         portrait = portrait_pixels(sample["source"])
-        out.append(place(layout, sample["driven"][0], at, owners, codes, portrait, SPLAT_SIZE))
+        rim, driven = outline_rim(portrait), sample["driven"][0]
+        out.append(place(layout, driven, at, owners, rim, codes, portrait, SPLAT_SIZE))
     return out
 
 

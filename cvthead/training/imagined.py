@@ -22,6 +22,7 @@ from cvthead.points import PointLayout
 from cvthead.runtime.fill import ZERO
 from cvthead.runtime.ghosts import point_owners
 from cvthead.runtime.place import SEEN, SOFT_EDGE, coded, place
+from cvthead.runtime.seams import outline_rim
 from cvthead.source import network_input, places, portrait_pixels
 
 Array = NDArray[np.float32]
@@ -89,21 +90,16 @@ def imagined(
     across[: layout.surface] = own[layout.mirror]
     seen = at[:, 2:]
     colours = np.where(seen == SEEN, own, np.where(seen > 0, across, nearby))
-    placed = place(
-        layout,
-        points,
-        at,
-        point_owners(at, visible),
-        coded(colours, 1),
-        portrait_pixels(network),
-        size // 2,
-    )
+    portrait = portrait_pixels(network)
+    owners, rim = point_owners(at, visible), outline_rim(portrait)
+    placed = place(layout, points, at, owners, rim, coded(colours, 1), portrait, size // 2)
     colour = cv2.medianBlur(np.ascontiguousarray(placed.codes[..., 1:4]), SPECKLED)
     painted = cv2.resize(colour, (size, size), interpolation=cv2.INTER_LINEAR)
     carried = cv2.extractChannel(placed.warped, 3)
     # As far as points lie or the portrait shows the person, without the margin that a frame has.
     person = cv2.max(cv2.erode(placed.reach, SOFT_EDGE), carried)
-    # The portrait's outline is mixed with what was behind it: no seam of that inside the person.
+    # The portrait's outline is mixed with what was behind it: no seam of that inside the person,
+    # nor as near to its edge as cvthead.runtime.seams leaves it.
     inside = cv2.erode(person, RIM) == 255
     shown = np.where(inside, cv2.erode(carried, RIM), carried)[..., None] / np.float32(255)
     # The portrait is mixed with ZERO as far as it does not show the person.
