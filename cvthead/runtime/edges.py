@@ -35,7 +35,8 @@ def continued(rgba: Codes) -> Codes:
     known = alpha[::2, ::2] >= SOLID
     if not known.any():
         return rgba
-    colours = rgba.view(np.uint32)[::2, ::2].ravel()  # four bytes at once
+    fours = np.ascontiguousarray(rgba).view(np.uint32)  # four bytes at once
+    colours = fours[::2, ::2].ravel()
     nearest = colours[nearest_pixels(known)][..., None].view(np.uint8)
     beyond = cv2.resize(nearest, rgba.shape[1::-1], interpolation=cv2.INTER_LINEAR)
     own = cv2.LUT(alpha, OWN_SHARE)
