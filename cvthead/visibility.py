@@ -39,12 +39,12 @@ def visible_points(
     Args:
         layout: numbering of the points.
         faces: (F, 3) triangles over the mesh vertices.
-        points: (layout.total, 3) normalised source projections.
+        points: (P, 3) normalised projections, those of the shell as many as there are.
         mask: (S, S) person mask of the crop, 0..1, 0 beyond the picture.
         scale: of the normalised camera, normalised units per metre.
 
     Returns:
-        (layout.total,) bool.
+        (P,) bool.
     """
     shown = inside_mask(points, mask)
     found = _in_front(points, scale) & _facing(layout, faces, points) & shown
@@ -61,10 +61,10 @@ def agreed(
 
     Args:
         layout, faces: as for :func:`visible_points`.
-        visible: (layout.total,).
+        visible: (P,).
 
     Returns:
-        (layout.total,), shell points as they were.
+        (P,), shell points as they were.
     """
     out, count = visible.copy(), layout.vertices
     one, other = mesh_edges(faces).T
@@ -121,7 +121,7 @@ def _facing(
     # In image axes (y down, depth away) an outward normal towards the camera has negative z.
     towards = -vertex_normals(vertices, faces)[:, 2]
     a, b = layout.edges.T
-    facing = np.ones(layout.total, dtype=bool)
+    facing = np.ones(len(points), dtype=bool)
     facing[: layout.vertices] = towards > -GRAZING
     facing[layout.vertices : layout.surface] = (towards[a] + towards[b]) / 2 > -GRAZING
     return facing

@@ -16,7 +16,6 @@ import torch
 
 from cvthead import Avatar, Pipeline
 from cvthead.errors import AssetError
-from cvthead.images import read_image
 from cvthead.model import splat as torch_splat
 from cvthead.model.fill import fill as torch_fill
 from cvthead.model.light_unet import even as torch_even
@@ -33,27 +32,13 @@ from cvthead.runtime.model_folder import (
 from cvthead.runtime.networks import Networks
 from cvthead.runtime.splat import EMPTY_DEPTH, splat
 from cvthead.runtime.subpixels import shuffled, unshuffled
-from cvthead.source import Source, cut_head, read_source
+from cvthead.source import Source
 from cvthead.training.static_int8 import psnr
 from tools import engine_page
 from tools.engine_page import FloatNetwork
 
 PORTRAIT = Path(__file__).parents[1] / "examples" / "astronaut.png"
 MIN_PSNR = 40.0
-
-
-@pytest.fixture(scope="module")
-def source(pipeline: Pipeline) -> Source:
-    """Read beside ``avatar``: what other tests do to the process's threads moves tracked
-    coefficients by a millionth, which decides how a few points of the hair are fitted."""
-    image = read_image(PORTRAIT)
-    crop = cut_head(pipeline.tracker, image, pipeline.tracker.track(image))
-    return read_source(pipeline.deformer, pipeline.layout, crop)
-
-
-@pytest.fixture(scope="module")
-def avatar(pipeline: Pipeline, source: Source) -> Avatar:
-    return pipeline.encode(read_image(PORTRAIT))
 
 
 @pytest.fixture(scope="module")

@@ -83,7 +83,6 @@ def test_a_turned_head_shows_nothing_of_what_was_behind_it(
             seen = (level > 150) & (red < 100) & (blue < 100) & (alpha > 128)
             shown[number] += seen[deep].sum()
     assert shown[0] > 50
-    print("N", shown)
     assert shown[1] < 0.1 * shown[0]
 
 

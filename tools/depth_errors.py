@@ -27,9 +27,7 @@ from cvthead.evaluation.shots import Shot, read_take, rotation
 from cvthead.evaluation.videos import find_videos
 from cvthead.head.model import Region
 from cvthead.pipeline import Pipeline
-from cvthead.points import FAR_AWAY
 from cvthead.silhouette import pixel_of
-from cvthead.source import driven_points
 from cvthead.visibility import visible_points
 from tools.st_lpips_parts import flow_between
 
@@ -46,13 +44,10 @@ def residuals(
     """For each part: its name, pixels (2,) that a metre nearer to the source's camera would move
     it by in this frame, and pixels (2,) that it still has to move by."""
     wanted, camera = drive(pipeline.head, avatar, driver.face, crop=driver.head.crop)
-    drawn = pipeline.render_coefficients(avatar, wanted, camera)
-    target = driver.head
-    shown = Drawn(drawn.rgb, drawn.alpha.astype(np.float32) / np.float32(255))
+    points = pipeline.pose(avatar, wanted, camera)
+    shown, target = Drawn.of(pipeline.paint(avatar, points)), driver.head
     pictures = shown.on_white, Drawn(target.image, target.mask).on_white
     there, back = flow_between(*pictures), flow_between(*pictures[::-1])
-    points = driven_points(pipeline.head, pipeline.layout, wanted, avatar.deformation, camera)
-    points[: len(avatar.drawn)][~avatar.drawn] = FAR_AWAY
     both = np.minimum(shown.alpha, target.mask)
     visible = visible_points(pipeline.layout, pipeline.head.faces, points, both, camera.scale)
     pixels, size = to_pixels(points), len(there)

@@ -18,6 +18,7 @@ from cvthead.driving import at_neck, drive
 from cvthead.evaluation.baselines import ColouredMesh
 from cvthead.evaluation.metrics import Picture, on_white
 from cvthead.evaluation.shots import Image, Shot, rotation
+from cvthead.frame import Frame
 from cvthead.head.model import HeadModel
 from cvthead.official.painted import HARD_MASK, Painted
 from cvthead.official.pipeline import OfficialPipeline
@@ -33,6 +34,11 @@ class Drawn:
 
     rgb: Image
     alpha: Picture
+
+    @classmethod
+    def of(cls, frame: Frame) -> Drawn:
+        """What a pipeline rendered."""
+        return cls(frame.rgb, frame.alpha.astype(np.float32) / np.float32(255))
 
     @property
     def on_white(self) -> Image:
@@ -108,7 +114,7 @@ def trained(pipeline: Preset[Any], *, deform: bool = True) -> Method:
                 points = pipeline.pose(avatar, coefficients, camera)
                 return hard_masked(pipeline.paint(avatar, points))
             frame = pipeline.render_coefficients(avatar, coefficients, camera)
-            return Drawn(frame.rgb, frame.alpha.astype(np.float32) / np.float32(255))
+            return Drawn.of(frame)
 
         return Person(
             avatar.coefficients, avatar.camera, pipeline.preset, pipeline.head, draw, read
