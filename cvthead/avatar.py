@@ -22,8 +22,8 @@ from cvthead.coefficients import EXPRESSION_SIZE, POSE_SIZE, SHAPE_SIZE, Coeffic
 from cvthead.deformation import MAX_SHELL_POINTS, Deformation
 from cvthead.files import write_file
 from cvthead.images import DAMAGE
+from cvthead.points import SEEN
 from cvthead.runtime.ghosts import point_owners
-from cvthead.runtime.place import SEEN
 from cvthead.runtime.seams import outline_rim
 
 FORMAT = "cvthead-avatar"

@@ -147,7 +147,7 @@ class Pipeline:
 
     def describe(self, source: Source) -> NDArray[np.uint8]:
         """(P, C) descriptor codes of a source, unused shell points left out."""
-        return self.networks.describe(source, source.nearby(self.layout))[: self._used(source)]
+        return self.networks.describe(source, source.hidden(self.layout))[: self._used(source)]
 
     def _used(self, source: Source) -> int:
         return self.layout.surface + len(source.deformation.shell_anchor)

@@ -17,6 +17,8 @@ from cvthead.head import mesh
 from cvthead.head.model import HeadModel, Region
 
 DETAIL_REGIONS = (Region.FACE, Region.EYES, Region.MOUTH)
+SEEN, SEEN_MIRRORED = 1.0, 0.5  # by the portrait; only the point across the face is; else 0
+THROAT = 0.04  # metres behind the front teeth; what lies deeper is never seen
 FAR_AWAY = np.array([-10.0, -10.0, 50.0], dtype=np.float32)
 
 
@@ -31,6 +33,8 @@ class PointLayout:
         region: (N + D,) Region of each point; a midpoint has its first vertex's.
         detail_vertices: (V,) vertices of face, eyes and mouth.
         detail_faces: (F, 3) triangles between those, numbered within detail_vertices.
+        face: (Q,) points of the face, without eyes and mouth.
+        throat: (T,) points of the mouth that lie too deep to be seen.
     """
 
     vertices: int
@@ -39,6 +43,8 @@ class PointLayout:
     region: NDArray[np.integer]
     detail_vertices: NDArray[np.int64]
     detail_faces: NDArray[np.int32]
+    face: NDArray[np.intp]
+    throat: NDArray[np.intp]
 
     @classmethod
     def of(cls, head: HeadModel) -> PointLayout:
@@ -52,13 +58,19 @@ class PointLayout:
         count = len(head.template)
         mirror = np.concatenate([head.mirror, np.asarray(twin) + count])
         own, faces = np.unique(head.faces[detail[head.faces].all(1)], return_inverse=True)
+        region = np.concatenate([head.region, head.region[edges[:, 0]]])
+        forward = np.concatenate([head.template[:, 2], head.template[edges, 2].mean(1)])
+        mouth = region == Region.MOUTH
+        deep = mouth & (forward < forward[mouth].max() - THROAT)
         return cls(
             count,
             edges.astype(np.int32),
             mirror.astype(np.int32),
-            np.concatenate([head.region, head.region[edges[:, 0]]]),
+            region,
             own.astype(np.int64),
             faces.reshape(-1, 3).astype(np.int32),
+            np.flatnonzero(region == Region.FACE),
+            np.flatnonzero(deep),
         )
 
     @property

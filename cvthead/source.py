@@ -14,12 +14,11 @@ from cvthead.coefficients import Coefficients
 from cvthead.crop import head_crop
 from cvthead.deformation import Deformation, DeformationModel, points, to_pixels
 from cvthead.head.model import HeadModel, Region
-from cvthead.nearby import nearby_colours
-from cvthead.points import PointLayout
-from cvthead.runtime.place import SEEN, SEEN_MIRRORED
+from cvthead.hidden import hidden_colours
+from cvthead.points import SEEN, SEEN_MIRRORED, PointLayout
 from cvthead.silhouette import person_mask
 from cvthead.tracking.tracker import TrackedFace, Tracker
-from cvthead.visibility import eroded, on_person, visible_points
+from cvthead.visibility import clear_points, eroded, on_person, visible_points
 
 Array = NDArray[np.float32]
 
@@ -57,6 +56,7 @@ class Source:
         deformation: hair and shoulders in rest space.
         points: (P, 3) normalised projections, numbered by the PointLayout.
         visible: (P,) bool, which of them the portrait sees.
+        clear: (P,) bool, which of those have their own colour, see cvthead.visibility.
         drawn: (P,) bool, which of them are part of the avatar; the others lie beyond the
             picture's edge, or beside the person.
     """
@@ -65,15 +65,16 @@ class Source:
     deformation: Deformation
     points: Array
     visible: NDArray[np.bool_]
+    clear: NDArray[np.bool_]
     drawn: NDArray[np.bool_]
 
     def places(self, layout: PointLayout) -> Array:
         """(P, 3) each point's x and y in the portrait, and how the portrait sees it."""
         return places(layout, self.points, self.visible)
 
-    def nearby(self, layout: PointLayout) -> Array:
-        """(P, 3) colours around the points that the portrait hides, see cvthead.nearby."""
-        return nearby_colours(layout, self.network_input, self.points, self.visible)
+    def hidden(self, layout: PointLayout) -> Array:
+        """(P, 3) colours of the points that the portrait hides, see cvthead.hidden."""
+        return hidden_colours(layout, self.network_input, self.points, self.clear)
 
     @cached_property
     def network_input(self) -> Array:
@@ -162,8 +163,10 @@ def read_source(
         deformation = Deformation.none(model)
     projected = driven_points(model, layout, head.coefficients, deformation, head.camera)
     if all_seen:
-        visible = np.ones(len(projected), np.bool_)
+        visible = clear = np.ones(len(projected), np.bool_)
     else:
         mask = eroded(head.mask, 1)
         visible = visible_points(layout, model.faces, projected, mask, head.camera.scale)
-    return Source(head, deformation, projected, visible, on_person(projected, head.mask))
+        clear = clear_points(projected, visible, head.mask)
+    drawn = on_person(projected, head.mask)
+    return Source(head, deformation, projected, visible, clear, drawn)

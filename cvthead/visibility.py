@@ -23,6 +23,8 @@ DEPTH_TOLERANCE = 0.012
 GRAZING = 0.1
 MASK_LEVEL = 0.5
 MARGIN = 1.0  # pixels
+# Pixels of the 256 x 256 crop beside the outline, where the person is mixed with the background.
+RIM = 4
 ROUNDS = 2
 UNDECIDED = 0.1  # of the neighbours, more or less than half: the vertex's own answer stays
 
@@ -84,6 +86,22 @@ def inside_mask(points: NDArray[np.float32], mask: NDArray[np.float32]) -> NDArr
     """(P,) whether each projection lies in the frame and on the person."""
     inside, column, row = _pixels(points, mask.shape[0])
     return np.asarray(inside & (mask[row, column] > MASK_LEVEL))
+
+
+def clear_points(
+    points: NDArray[np.float32], visible: NDArray[np.bool_], mask: NDArray[np.float32]
+) -> NDArray[np.bool_]:
+    """Visible points clear of the person's outline, so that the colour there is their own.
+
+    Args:
+        points: (P, 3) normalised projections.
+        visible: (P,).
+        mask: (S, S) person mask of the crop, 0..1.
+
+    Returns:
+        (P,) bool.
+    """
+    return visible & inside_mask(points, eroded(mask, RIM))
 
 
 def on_person(points: NDArray[np.float32], mask: NDArray[np.float32]) -> NDArray[np.bool_]:

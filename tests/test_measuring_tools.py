@@ -1,6 +1,7 @@
 """tools/latency_plot.py and tools/footprint.py: what they print, not how fast it is; and
 tools/st_lpips_parts.py: that what it replaces or moves lies nearer to the target; and
-tools/depth_errors.py: that it finds the depth by which a head was made too flat."""
+tools/depth_errors.py: that it finds the depth by which a head was made too flat; and
+tools/hidden_colours.py: that it compares what is hidden alone, with its true colour."""
 
 from __future__ import annotations
 
@@ -22,8 +23,10 @@ from cvthead.evaluation.shots import Shot, shoot
 from cvthead.head.model import Region
 from cvthead.images import read_image
 from cvthead.sample import SAMPLE
+from cvthead.source import read_source
 from tools.depth_errors import residuals
 from tools.footprint import base_dependencies, resident_bytes, service_lines
+from tools.hidden_colours import compared, guesses
 from tools.latency_plot import measure, plot, table
 from tools.st_lpips_parts import pictures, regions
 
@@ -129,3 +132,24 @@ def test_a_part_that_lies_too_deep_asks_to_be_nearer(pipeline: Pipeline, avatar:
                 found.append((nearer[0], beside[0]))
     across, beside = np.array(found).T
     assert 0.01 < (across * beside).sum() / (across**2).sum() < 0.05  # metres
+
+
+def test_hidden_colours_are_compared_with_what_is_there(pipeline: Pipeline, shot: Shot) -> None:
+    """A portrait, half of which is taken for hidden, is compared with itself."""
+    layout, head = pipeline.layout, pipeline.head
+    whole = read_source(pipeline.deformer, layout, shot.head)
+    half = whole.clear.copy()
+    half[: layout.vertices] &= head.template[:, 0] <= 0
+    half[layout.vertices : layout.surface] &= head.template[layout.edges, 0].mean(1) <= 0
+    errors = compared(pipeline, replace(whole, clear=half), shot)
+    face = {name: errors["FACE", True, name] for name in ("across", "nearest", "both")}
+    counts = {len(each) for each in face.values()}
+    assert len(counts) == 1
+    assert 500 < counts.pop() <= (whole.clear & ~half)[: layout.surface].sum()
+    # The portrait is lit evenly, so what lies across is nearly right.
+    assert 0 < face["across"].mean() < face["both"].mean() < face["nearest"].mean()
+    assert not compared(pipeline, whole, shot)["FACE", True, "both"].size
+    shown = whole.clear[: layout.surface]
+    guessed = guesses(pipeline, whole)
+    assert not guessed["both"][shown].any()
+    assert guessed["nearest"][~shown].any(1).mean() > 0.9

@@ -7,8 +7,9 @@ import pytest
 
 from cvthead import Avatar, Pipeline
 from cvthead.head.model import Region
+from cvthead.points import SEEN, SEEN_MIRRORED
 from cvthead.runtime.ghosts import point_owners
-from cvthead.runtime.place import SEEN, SEEN_MIRRORED, place
+from cvthead.runtime.place import place
 from cvthead.runtime.triangles import FAR, rasterise
 from cvthead.runtime.warp import dense_flow, warp
 

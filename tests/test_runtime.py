@@ -147,10 +147,10 @@ def test_networks_of_another_version_are_refused(tmp_path: Path) -> None:
     shutil.copytree(packaged("open"), folder)
     network = onnx.load(str(folder / DESCRIBE))
     for given in network.graph.input:
-        if given.name == "nearby":
+        if given.name == "hidden":
             given.name = "unknown"
     for node in network.graph.node:
-        node.input[:] = ["unknown" if name == "nearby" else name for name in node.input]
+        node.input[:] = ["unknown" if name == "hidden" else name for name in node.input]
     onnx.save(network, str(folder / DESCRIBE))
     before = ModelFolder.load(folder)
     write_record(folder, before.preset, before.fingerprint, before.training)

@@ -37,6 +37,7 @@ from tools.skinning import (
     joint_regressor,
     linear_blend_weights,
     regions,
+    scalp_in_one_piece,
 )
 from tools.surface import Floats, Ints, Surface, clip, subdivide
 from tools.topology import BaseHead, Part, base_head, mirror_map
@@ -133,6 +134,7 @@ def build(data: MakeHuman) -> dict[str, NDArray[np.generic]]:
     mirror = mirror_map(template, part)
     template = symmetric(template, mirror)
     region = regions(carry(base), carry(bones.skull), carry(bones.head), part)
+    region = scalp_in_one_piece(region, surface.faces)
 
     shape, shape_parity = identity_space(sampled, head, surface, bones, base)
     shape = symmetric(shape, mirror, shape_parity)

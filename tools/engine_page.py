@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cvthead.avatar import Avatar
+from cvthead.camera import CROP_PIXELS
 from cvthead.controls import Controls, resolve
 from cvthead.deformation import MAX_SHELL_POINTS
 from cvthead.evaluation.page import Grid, write_page
@@ -28,10 +29,15 @@ from cvthead.head.hierarchy import MeshHierarchy
 from cvthead.images import read_image
 from cvthead.model.config import OPEN
 from cvthead.model.cvthead import CVTHead
+from cvthead.model.splat import splat
 from cvthead.pipeline import Pipeline
 from cvthead.points import FAR_AWAY
 from cvthead.runtime.edges import continued
+from cvthead.runtime.face import splatted
+from cvthead.runtime.holes import without_holes
+from cvthead.runtime.lend import lend
 from cvthead.runtime.model_folder import WEIGHTS, packaged
+from cvthead.runtime.place import COLOURS
 from cvthead.runtime.threads import one_thread_per_call
 from cvthead.source import Source, as_network_input, cut_head, read_source
 from cvthead.training.static_int8 import psnr
@@ -70,9 +76,9 @@ class FloatNetwork:
         """(1, P, C) descriptors of all points of the layout."""
         anchor = np.zeros(MAX_SHELL_POINTS, np.int64)
         anchor[: len(source.deformation.shell_anchor)] = source.deformation.shell_anchor
-        visible = source.visible.astype(np.float32)
-        nearby = source.nearby(self.pipeline.layout)
-        inputs = (source.network_input, source.points, visible, anchor, nearby)
+        clear = source.clear.astype(np.float32)
+        hidden = source.hidden(self.pipeline.layout)
+        inputs = (source.network_input, source.points, clear, anchor, hidden)
         return self.model.describe(*(torch.from_numpy(x)[None] for x in inputs))
 
     def paint(
@@ -85,20 +91,25 @@ class FloatNetwork:
         """
         layout = self.pipeline.layout
         every = np.tile(FAR_AWAY, (layout.total, 1))
-        every[: len(points)] = points
+        every[: len(points)] = splatted(layout, points, CROP_PIXELS)
         placed = self.pipeline.place(avatar, points)
-        rgb, logits = self.model.paint(
-            torch.from_numpy(every)[None],
-            descriptors,
-            torch.from_numpy(source.places(layout)[None, :, 2]),
-            torch.from_numpy(as_network_input(placed.warped))[None],
-        )
+        seen = torch.from_numpy(source.places(layout)[None, :, 2])
+        values = torch.cat([descriptors, seen[..., None]], dim=-1)
+        image = splat(torch.from_numpy(every)[None], values, len(placed.lent))
+        warped = torch.from_numpy(as_network_input(placed.warped))[None]
+        painted, logits, gate = self.model.unet.parts(self.model.filled(image), warped)
         # Beside sharp edges the filter over what is painted overshoots.
-        colour = ((rgb[0].permute(1, 2, 0) + 1) * 127.5).clamp(0, 255)
-        alpha = logits[0, 0].sigmoid() * 255
-        pixels, mask = (x.round().to(torch.uint8).numpy() for x in (colour, alpha))
+        colour, opaque = ((painted + 1) * 127.5).clamp(0, 255), logits.sigmoid() * 255
+        exact = torch.cat([colour, opaque], dim=1)[0].permute(1, 2, 0).round().to(torch.uint8)
+        lent = lend(exact.numpy(), placed.codes[..., COLOURS], placed.lent)
+        shown = gate[0, 0].numpy()
+        rgba = cv2.blendLinear(placed.warped, lent, shown, 1 - shown)
         # Beyond the points no network is asked.
-        return Frame.of_rgba(continued(np.dstack([pixels, np.minimum(mask, placed.reach)])))
+        alpha = np.minimum(lent[..., 3], placed.reach)
+        rgba[..., 3] = alpha
+        out = continued(np.asarray(rgba, np.uint8))
+        out[..., 3] = without_holes(alpha, placed.reach)
+        return Frame.of_rgba(out)
 
 
 def compare(network: FloatNetwork, portrait: Path) -> tuple[Grid, list[float]]:

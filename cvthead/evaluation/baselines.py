@@ -17,7 +17,7 @@ from cvthead.coefficients import Coefficients
 from cvthead.deformation import Deformation, points
 from cvthead.evaluation.rasteriser import owners, shade
 from cvthead.head.model import HeadModel
-from cvthead.nearby import sampled
+from cvthead.hidden import sampled
 
 Array = NDArray[np.float32]
 

@@ -60,22 +60,21 @@ class CVTHead(nn.Module):
         self.unet = LightUNet(size_in, config.unet_sizes, config.unet_unshuffle)
 
     def describe(
-        self, source: Tensor, points: Tensor, visible: Tensor, anchor: Tensor, nearby: Tensor
+        self, source: Tensor, points: Tensor, clear: Tensor, anchor: Tensor, hidden: Tensor
     ) -> Tensor:
         """Point descriptors of a source image (paper section 3.3).
 
         Args:
             source: (b, 4, 256, 256), RGB in [-1, 1] with 0 outside the person, and the mask.
             points: (b, p, 3) normalised source projections: vertices, midpoints, shell.
-            visible: (b, p) 1 where the source sees the point.
+            clear: (b, p) 1 where the source shows the point, see cvthead.visibility.clear_points.
             anchor: (b, shell) vertex that each shell point hangs on.
-            nearby: (b, p, 3) of cvthead.nearby; not used by the transformer alone.
+            hidden: (b, p, 3) of cvthead.hidden; not used by the transformer alone.
 
         Returns:
             (b, p, C) float32.
         """
         tokens, pixels = self.encoder(source)
-        hidden: Tensor | None = nearby
         if self.config.features == "pixel-aligned":
             size = self.config.upsampler_sizes[-1]
             vertex = points.new_zeros(len(points), self.fusion.vertex_embedding.shape[0], size)
@@ -85,15 +84,16 @@ class CVTHead(nn.Module):
             x = self.transformer(x)[:, : len(self.coarse)]
             vertex = self.upsampler(x)  # b n f
             if self.config.features == "transformer":
-                visible, hidden = torch.zeros_like(visible), None
+                clear = torch.zeros_like(clear)
         embedding = self.fusion.vertex_embedding.expand(len(source), -1, -1)
         feature = self._spread(vertex, anchor)
         embedding = self._spread(embedding, anchor)
         embedding[:, -anchor.shape[1] :] += self.fusion.shell_embedding
         shell = torch.arange(len(self.mirror), points.shape[1], device=self.mirror.device)
         mirror = torch.cat([self.mirror, shell])
+        lent = None if self.config.features == "transformer" else hidden
         out: Tensor = self.fusion(
-            feature, embedding, pixels.float(), source, points, visible, mirror, hidden
+            feature, embedding, pixels.float(), source, points, clear, mirror, lent
         )
         return out
 
@@ -109,7 +109,7 @@ class CVTHead(nn.Module):
         """Neural vertex rendering (paper section 3.4).
 
         Args:
-            points: (b, p, 3) normalised driven projections.
+            points: (b, p, 3) normalised driven projections, see cvthead.runtime.face.splatted.
             descriptors: (b, p, C) from :meth:`describe`.
             seen: (b, p) how the portrait sees each point, see cvthead.source.places.
             warped: (b, 4, size, size), the source as given to :meth:`describe`, carried to the

@@ -80,6 +80,16 @@ class LightUNet(nn.Module):
             RGB (b, 3, h, w) in [-1, 1], a little beyond beside sharp edges: warped pixels and
             painted ones, mixed by a learned gate; mask logits (b, 1, h, w).
         """
+        painted, logits, gate = self.parts(splat, warped, carry=carry)
+        if self.training:
+            gate = gate * (torch.rand(len(gate), 1, 1, 1) > GATE_DROPOUT)
+        return gate * warped[:, :3] + (1 - gate) * painted, logits
+
+    def parts(
+        self, splat: Tensor, warped: Tensor, *, carry: bool = True
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """The painted RGB (b, 3, h, w), mask logits (b, 1, h, w), and how far the warped portrait
+        is shown instead (b, 1, h, w), 0..1; arguments as :meth:`forward`."""
         if not carry:
             warped = torch.zeros_like(warped)
         x = self.stem(torch.cat([splat, F.pixel_unshuffle(warped, self.unshuffle)], dim=1))
@@ -88,10 +98,7 @@ class LightUNet(nn.Module):
         portrait = torch.cat([warped[:, :3] * 0.5 + 0.5, warped[:, 3:]], dim=1) * carry
         out = self.to_image(torch.cat([x, portrait.to(x.dtype)], dim=1)).float()
         out = even(torch.cat([clipped(out[:, :3]), out[:, 3:]], dim=1))
-        gate = torch.sigmoid(out[:, 4:]) * carry
-        if self.training:
-            gate = gate * (torch.rand(len(gate), 1, 1, 1) > GATE_DROPOUT)
-        return gate * warped[:, :3] + (1 - gate) * out[:, :3], out[:, 3:4]
+        return out[:, :3], out[:, 3:4], torch.sigmoid(out[:, 4:]) * carry
 
     def after_stem(self, x: Tensor) -> Tensor:
         """The stem's output (b, sizes[0], h / u, w / u) -> (b, PIXEL_SIZE * u * u, h / u, w / u),

@@ -2,8 +2,8 @@
 
 The paper argues (section 3.3) that features sampled at a vertex's projection are sharp where
 the vertex is visible and wrong where it is not. So they are gated by visibility; hidden points
-see their mirrored counterpart when that is visible, and the transformer's feature always. Where
-neither is, the colour is that of the nearest visible points.
+see their mirrored counterpart when that is visible, and the transformer's feature always. Their
+colour is lent by points that are visible (cvthead/hidden.py).
 The first three descriptor channels are the point's colour in [-1, 1].
 """
 
@@ -42,9 +42,9 @@ class PixelAlignedFusion(nn.Module):
         pixels: Tensor,
         source: Tensor,
         points: Tensor,
-        visible: Tensor,
+        clear: Tensor,
         mirror: Tensor,
-        nearby: Tensor | None,
+        hidden: Tensor | None,
     ) -> Tensor:
         """Descriptors of all points.
 
@@ -54,26 +54,26 @@ class PixelAlignedFusion(nn.Module):
             pixels: (b, pixel_size, 128, 128) from the encoder.
             source: (b, 4, 256, 256).
             points: (b, p, 3) source projections.
-            visible: (b, p) 1 where the source sees the point, else 0.
+            clear: (b, p) 1 where the source shows the point clear of the outline, else 0.
             mirror: (p,) the point's mirrored counterpart.
-            nearby: (b, p, 3) colour where neither is visible, see cvthead.nearby; None lets the
-                network guess it.
+            hidden: (b, p, 3) colour of the others, see cvthead.hidden; None lets the network
+                guess it.
 
         Returns:
             (b, p, size): colour, then learned channels.
         """
-        own = visible[..., None]
+        own = clear[..., None]
         other = own[:, mirror] * (1 - own)
         colour = sample(source[:, :COLOUR_SIZE], points) * own
-        mirrored_colour = colour[:, mirror] * other
+        lent = torch.zeros_like(colour) if hidden is None else hidden * (1 - own)
         aligned = sample(pixels, points) * own
         aligned = aligned + aligned[:, mirror] * other
-        inputs = [features, aligned, colour, mirrored_colour, own, other, embedding]
+        inputs = [features, aligned, colour, lent, own, other, embedding]
         out = self.head(torch.cat([x.float() for x in inputs], dim=-1))
-        known = own + other
-        # Not a guess on top of what lies nearby: that learnt to mark hidden points with green. (The
-        # layer's first three rows serve the transformer alone, which is told of nothing nearby.)
-        hidden = torch.tanh(out[..., :COLOUR_SIZE].float()) if nearby is None else nearby
-        painted = colour + mirrored_colour + (1 - known) * hidden
+        # Not a guess on top of the lent colour: that learnt to mark hidden points with green. (The
+        # layer's first three rows serve the transformer alone, which is told of no colour.)
+        if hidden is None:
+            lent = torch.tanh(out[..., :COLOUR_SIZE].float()) * (1 - own)
+        painted = colour + lent
         learned = out[..., COLOUR_SIZE:].float()
         return torch.cat([painted, learned], dim=-1)

@@ -7,6 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvthead.runtime.edges import continued
+from cvthead.runtime.holes import without_holes
+from cvthead.runtime.lend import lend
+from cvthead.runtime.place import COLOURS, Placed
 from cvthead.runtime.subpixels import shuffled
 
 Codes = NDArray[np.uint8]
@@ -22,27 +25,30 @@ EVEN = (-1 / 16, 4 / 16, 10 / 16, 4 / 16, -1 / 16)
 LINE = np.array(EVEN, np.float32)
 
 
-def mix(codes: Codes, warped: Codes, reach: Codes) -> Codes:
+def mix(codes: Codes, placed: Placed) -> Codes:
     """One frame.
 
     Args:
         codes: (s, s, 20) of the network: RGB and mask of each of a block's pixels, then the
             pixels' gates.
-        warped: (2s, 2s, 4) the portrait carried to the pose.
-        reach: (2s, 2s) highest alpha.
+        placed: what the network was given.
 
     Returns:
-        (2s, 2s, 4) RGBA; beyond the person, colours go on as cvthead.runtime.edges says.
+        (2s, 2s, 4) RGBA; beyond the person and in its holes, colours go on as
+        cvthead.runtime.edges says.
     """
     fours = codes.view(np.uint32)  # a block's four pixels, then its four gates
     pixels = shuffled(np.ascontiguousarray(fours[..., :GATES]))
-    painted = evened(pixels.view(np.uint8).reshape(warped.shape))
+    painted = evened(pixels.view(np.uint8).reshape(placed.warped.shape))
+    painted = lend(painted, placed.codes[..., COLOURS], placed.lent)
     gates = shuffled(np.ascontiguousarray(fours[..., GATES:]).view(np.uint8))
     gate = cv2.LUT(evened(gates), GATE)
-    out = cv2.blendLinear(warped, painted, gate, 1 - gate)
-    alpha = cv2.min(cv2.LUT(cv2.extractChannel(painted, 3), ALPHA), reach)
+    out = cv2.blendLinear(placed.warped, painted, gate, 1 - gate)
+    alpha = cv2.min(cv2.LUT(cv2.extractChannel(painted, 3), ALPHA), placed.reach)
     cv2.insertChannel(alpha, out, 3)
-    return continued(np.asarray(out, np.uint8))
+    out = continued(np.asarray(out, np.uint8))
+    cv2.insertChannel(without_holes(np.asarray(alpha, np.uint8), placed.reach), out, 3)
+    return out
 
 
 def evened(image: NDArray[np.generic]) -> Codes:

@@ -21,7 +21,7 @@ from cvthead.runtime.threads import cores
 from cvthead.source import Source
 
 MAX_THREADS = 4  # more bring nothing at this size
-DESCRIBE_INPUTS = ("source", "points", "visible", "anchor", "nearby")
+DESCRIBE_INPUTS = ("source", "points", "clear", "anchor", "hidden")
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class Networks:
         splat_size: height and width of the splat, half of the frame's.
         fingerprint: of the trained weights.
         preset: of the model.
-        all_seen: see cvthead.source.read_source.
+        features: fused, or of an ablation; see cvthead.training.config.
     """
 
     describe_session: ort.InferenceSession
@@ -44,7 +44,12 @@ class Networks:
     splat_size: int
     fingerprint: str
     preset: str
-    all_seen: bool
+    features: str
+
+    @property
+    def all_seen(self) -> bool:
+        """All points count as seen: the ablation with pixel-aligned features alone."""
+        return self.features == "pixel-aligned"
 
     @classmethod
     def load(
@@ -80,15 +85,15 @@ class Networks:
             )
         _, size, _, channels = paint.get_inputs()[0].shape
         descriptors = channels - code_size(0)
-        all_seen = folder.training.get("features") == "pixel-aligned"
-        return cls(describe, paint, descriptors, size, folder.fingerprint, folder.preset, all_seen)
+        features = folder.training.get("features", "fused")
+        return cls(describe, paint, descriptors, size, folder.fingerprint, folder.preset, features)
 
-    def describe(self, source: Source, nearby: NDArray[np.float32]) -> NDArray[np.uint8]:
+    def describe(self, source: Source, hidden: NDArray[np.float32]) -> NDArray[np.uint8]:
         """(P, C) descriptor codes of all points of the layout.
 
         Args:
             source: the portrait.
-            nearby: (P, 3) of cvthead.nearby.
+            hidden: (P, 3) of cvthead.hidden.
         """
         shell = source.deformation.shell_anchor
         anchor = np.zeros((1, MAX_SHELL_POINTS), np.int64)
@@ -96,9 +101,9 @@ class Networks:
         feed = {
             "source": source.network_input[None],
             "points": source.points[None],
-            "visible": source.visible[None].astype(np.float32),
+            "clear": source.clear[None].astype(np.float32),
             "anchor": anchor,
-            "nearby": nearby[None],
+            "hidden": hidden[None],
         }
         out: NDArray[np.uint8] = self.describe_session.run(None, feed)[0][0]
         return out
@@ -108,7 +113,6 @@ class Networks:
         codes = np.stack([one.codes for one in inputs])
         portrait = np.stack([unshuffled(one.warped) for one in inputs])
         painted = self.paint_session.run(None, {"splat": codes, "portrait": portrait})[0]
-        return [
-            mix(one, placed.warped, placed.reach)
-            for one, placed in zip(painted, inputs, strict=True)
-        ]
+        if self.features == "transformer":
+            inputs = [placed.without_lending() for placed in inputs]
+        return [mix(one, placed) for one, placed in zip(painted, inputs, strict=True)]

@@ -4,9 +4,9 @@ A descriptor per point cannot hold every hair and pore. But each point knows whe
 shows it, so the splat also gives a flow from the driven frame back to the portrait; read through
 it, the portrait is a sharp first guess of everything the source saw. The face, whose lids, irises
 and lips move by less than a pixel of the splat, gets its flow from its triangles at full
-resolution. What of it the portrait hides is taken from the other side, if that is seen. What shows
-a second time where it no longer is (cvthead/runtime/ghosts.py) is taken out, and so is the
-portrait's outline where it has come to lie within the person (cvthead/runtime/seams.py).
+resolution (cvthead/runtime/face.py). What shows a second time where it no longer is
+(cvthead/runtime/ghosts.py) is taken out, and so is the portrait's outline where it has come to lie
+within the person (cvthead/runtime/seams.py).
 """
 
 from __future__ import annotations
@@ -17,26 +17,27 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cvthead.points import PointLayout
+from cvthead.points import SEEN, PointLayout
+from cvthead.runtime.face import carried_face, without_covered
 from cvthead.runtime.fill import FILL_LEVELS, ZERO, fill
 from cvthead.runtime.ghosts import ghosts
+from cvthead.runtime.lend import hidden_share
 from cvthead.runtime.seams import seams
 from cvthead.runtime.splat import EMPTY_DEPTH, splat
-from cvthead.runtime.triangles import FAR, rasterise
+from cvthead.runtime.triangles import FAR
 from cvthead.runtime.warp import dense_flow, warp
 
 Array = NDArray[np.float32]
 Codes = NDArray[np.uint8]
 
-SEEN, SEEN_MIRRORED = 1.0, 0.5  # by the portrait; only the point across the face is; else 0
 DEPTH_RANGE = 1.5  # normalised depths of a head in its crop lie well within -1.5..1.5
+COLOURS = slice(1, 4)  # of the codes, after the depth
 CODE_STEPS = 127  # codes of a range on either side of ZERO
 CLOSING = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9))  # closes gaps between points
 SOFT_EDGE = np.ones((3, 3), np.uint8)
 # Of the portrait, where it shows no person; four bytes at once.
 NOBODY = np.array([ZERO, ZERO, ZERO, 0], np.uint8).view(np.uint32)
 BEHIND = 0.06  # normalised depth, about 10 mm: further back a triangle lies behind the splat
-LARGEST_FLOW = 2.0  # normalised: twice the picture's half width
 
 
 class Placed(NamedTuple):
@@ -47,11 +48,17 @@ class Placed(NamedTuple):
             portrait sees the point, coverage at three scales.
         warped: (2s, 2s, 4) uint8, the portrait carried to the driven pose.
         reach: (2s, 2s) uint8, highest alpha; see :func:`reach_of`.
+        lent: (s, s) of cvthead.runtime.lend.hidden_share.
     """
 
     codes: Codes
     warped: Codes
     reach: Codes
+    lent: Array
+
+    def without_lending(self) -> Placed:
+        """For the transformer alone, which chooses all colours itself: an ablation."""
+        return self._replace(lent=np.zeros_like(self.lent))
 
 
 def code_size(descriptor_size: int) -> int:
@@ -81,7 +88,8 @@ def place(
         portrait: (256, 256, 4), see Avatar.
         size: of the splat, half of the frame's.
     """
-    owner = splat(points, size).ravel()
+    face = carried_face(layout, points, places, 2 * size)
+    owner = splat(without_covered(layout, points, face.depth), size).ravel()
     drawn = np.flatnonzero(owner >= 0)
     front = owner[drawn]
     # Gathered together, for gathering is what costs: flow, seen, depth.
@@ -106,14 +114,17 @@ def place(
     )
     ghost = ghosts(small, towards, owners, covered > 0)
     seam = seams(small, rim, covered)
-    refined = _refine(flow, layout, points, places, depth)
+    limit = np.where(known, depth + np.float32(BEHIND), np.float32(FAR))
+    limit = cv2.resize(limit, flow.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+    refined = face.known & (face.depth < limit)
+    cv2.copyTo(face.flow, refined.view(np.uint8), flow)
     warped = warp(portrait, flow)
     take_out(warped, ghost, seam, refined)
     codes = np.empty((size, size, code_size(descriptors.shape[1])), np.uint8)
     filled, codes[..., -FILL_LEVELS:] = fill(values.reshape(size, size, -1), known)
     codes[..., : filled.shape[2]] = filled
     codes[..., filled.shape[2]] = np.rint(seen * 255)
-    return Placed(codes, warped, reach_of(covered, warped))
+    return Placed(codes, warped, reach_of(covered, warped), hidden_share(seen == SEEN, known))
 
 
 def coded(values: Array, largest: float) -> Codes:
@@ -132,51 +143,6 @@ def take_out(warped: Codes, ghost: Array, seam: Array, kept: NDArray[np.bool_]) 
     gone = np.maximum(gone, cv2.resize(seam, sides, interpolation=cv2.INTER_LINEAR))
     nobody = np.full(warped.shape[:2], NOBODY).view(np.uint8).reshape(warped.shape)
     cv2.blendLinear(warped, nobody, 1 - gone, gone, warped)
-
-
-def _refine(
-    flow: Array, layout: PointLayout, points: Array, places: Array, depth: Array
-) -> NDArray[np.bool_]:
-    """Replace the flow (size, size, 2) where the face's triangles are in front: (size, size)."""
-    size, own = flow.shape[0], layout.detail_vertices
-    corners, faces = points[own], layout.detail_faces
-    away = _votes(corners[:, 2] >= FAR, faces) > 0
-    if away.any():
-        faces = faces[~away]
-    if not len(faces):
-        return np.zeros((size, size), np.bool_)
-    sources = places[own]
-    seen = sources[:, 2] == SEEN
-    across = sources[:, 2] == SEEN_MIRRORED
-    mirrored = (_votes(across, faces) > 1) & (_votes(seen, faces) <= 1)
-    if mirrored.any():
-        # Every vertex twice: carried from its own place, and from the one across the face.
-        faces = np.where(mirrored[:, None], faces + len(own), faces)
-        corners = np.concatenate([corners, corners])
-        sources = np.concatenate([sources, places[layout.mirror[own]]])
-        seen = np.concatenate([seen, across])
-    carry = np.clip(sources[:, :2] - corners[:, :2], -LARGEST_FLOW, LARGEST_FLOW)
-    values = np.empty_like(corners)
-    values[:, :2] = carry * np.float32(0.5 / LARGEST_FLOW) + np.float32(0.5)
-    values[:, 2] = seen
-
-    image, front = rasterise(corners, faces, values, size)
-    limit = np.where(depth == EMPTY_DEPTH, np.float32(FAR), depth + np.float32(BEHIND))
-    hidden = cv2.resize(limit, (size, size), interpolation=cv2.INTER_NEAREST)
-    found = (cv2.extractChannel(image, 2) > np.float32(0.5)) & (front < hidden)
-    image -= np.float32(0.5)
-    image *= np.float32(2 * LARGEST_FLOW)
-    carried = np.empty_like(flow)
-    cv2.mixChannels([image], [carried], [0, 0, 1, 1])
-    cv2.copyTo(carried, found.view(np.uint8), flow)
-    return np.asarray(found)
-
-
-def _votes(chosen: NDArray[np.bool_], faces: NDArray[np.int32]) -> NDArray[np.uint8]:
-    """How many corners of each face (F, 3) are among the chosen vertices, 0 to 3."""
-    first, second, third = faces.T
-    counted = chosen.view(np.uint8)
-    return np.asarray(counted[first] + counted[second] + counted[third])
 
 
 def reach_of(covered: Codes, warped: Codes) -> Codes:

@@ -22,11 +22,12 @@ from torch.utils.data import Dataset
 from cvthead.deformation import MAX_SHELL_POINTS, Deformation
 from cvthead.driving import at_neck
 from cvthead.head.model import HeadModel
+from cvthead.hidden import hidden_colours
 from cvthead.model.config import OPEN
-from cvthead.nearby import nearby_colours
-from cvthead.points import FAR_AWAY, PointLayout
+from cvthead.points import FAR_AWAY, SEEN, PointLayout
+from cvthead.runtime.face import splatted
 from cvthead.runtime.ghosts import point_owners
-from cvthead.runtime.place import SEEN, Placed, place
+from cvthead.runtime.place import Placed, place
 from cvthead.runtime.seams import outline_rim
 from cvthead.source import (
     as_network_input,
@@ -40,7 +41,7 @@ from cvthead.training.details import ZOOMED, detail_weights, unseen_weights, zoo
 from cvthead.training.imagined import imagined, turned
 from cvthead.training.records import Frame, open_records
 from cvthead.training.sampling import group_shares, turned_still
-from cvthead.visibility import inside_mask, on_person
+from cvthead.visibility import clear_points, inside_mask, on_person
 
 Array = NDArray[np.float32]
 
@@ -185,22 +186,24 @@ class PairDataset(Dataset[dict[str, Tensor]]):
             np.maximum(detail_weights(marks, self.size), unseen_weights(each))[None]
             for marks, each in zip(landmarks, placed, strict=True)
         ]
-        nearby = nearby_colours(self.layout, network, own, visible > 0)
+        clear = clear_points(own, visible > 0, network[3])
+        hidden = hidden_colours(self.layout, network, own, clear)
         if self.all_seen:
-            visible = np.ones_like(visible)
+            visible, clear = np.ones_like(visible), np.ones_like(clear)
             ats, placed = carried()
         stack: dict[str, NDArray[Any]] = {
             "source": network,
             "points": own,
-            "visible": visible,
+            "clear": clear,
             "seen": np.stack([each[:, 2] for each in ats]),
             "anchor": anchor,
-            "nearby": nearby,
+            "hidden": hidden,
             "window": rng.random(3),
             "zoom": np.array([zoom_corner(each, zoomed, self.size) for each in landmarks]),
             "weight": np.stack(weights),
             "background": np.full((VIEWS, 3, 1, 1), 1, np.float32) * rng.random((1, 3, 1, 1)),
             "driven": np.stack(driven),
+            "splatted": np.stack([splatted(self.layout, each, self.size) for each in driven]),
             "warped": np.stack([as_network_input(each.warped) for each in placed]),
             **targets(views, self.size),
         }

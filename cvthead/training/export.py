@@ -32,14 +32,15 @@ from cvthead.head.model import HeadModel
 from cvthead.model.config import OPEN
 from cvthead.model.cvthead import CVTHead
 from cvthead.model.light_unet import PIXEL_SIZE, PORTRAIT_SIZE
-from cvthead.points import PointLayout
+from cvthead.model.pixel_aligned import COLOUR_SIZE
+from cvthead.points import SEEN, PointLayout
 from cvthead.runtime.ghosts import point_owners
 from cvthead.runtime.mix import LOGIT_RANGE
 from cvthead.runtime.model_folder import DESCRIBE, PAINT, WEIGHTS, write_record
 from cvthead.runtime.networks import DESCRIBE_INPUTS
-from cvthead.runtime.place import SEEN, Placed, place
+from cvthead.runtime.place import Placed, place
 from cvthead.runtime.seams import outline_rim
-from cvthead.source import places, portrait_pixels
+from cvthead.source import portrait_pixels
 from cvthead.training.checkpoint import averaged, read
 from cvthead.training.dataset import PairDataset
 from cvthead.training.onnx_export import export_describe, export_paint
@@ -115,6 +116,7 @@ def descriptor_range(model: CVTHead, calibration: Sequence[dict[str, NDArray[Any
             for sample in calibration
         ]
     largest = np.quantile(torch.cat(rows).abs().numpy(), DESCRIPTOR_SHARE, axis=0)
+    largest[:COLOUR_SIZE] = 1  # cvthead.runtime.lend takes them for bytes
     return torch.from_numpy(np.maximum(largest, 1e-3).astype(np.float32))
 
 
@@ -126,7 +128,7 @@ def frames(
     out = []
     for sample in calibration:
         codes = session.run(None, {name: sample[name][None] for name in DESCRIBE_INPUTS})[0][0]
-        at = places(layout, sample["points"], sample["visible"] > 0)
+        at = np.concatenate([sample["points"][:, :2], sample["seen"][0][:, None]], axis=1)
         owners = point_owners(at, at[:, 2] == SEEN)
         portrait = portrait_pixels(sample["source"])
         rim, driven = outline_rim(portrait), sample["driven"][0]
@@ -189,6 +191,8 @@ def export(
     largest = descriptor_range(model, calibration[:CALIBRATION])
     export_describe(model, largest, output / DESCRIBE)
     placed = frames(output / DESCRIBE, layout, calibration)
+    if model.config.features == "transformer":
+        placed = [each.without_lending() for each in placed]
     with tempfile.TemporaryDirectory() as folder:
         exact = Path(folder) / PAINT
         export_paint(model, largest, 1.0, exact)

@@ -17,13 +17,14 @@ from cvthead.crop import head_crop
 from cvthead.deformation import to_pixels
 from cvthead.driving import at_neck
 from cvthead.head.model import HeadModel
-from cvthead.nearby import nearby_colours, sampled
+from cvthead.hidden import hidden_colours, sampled
 from cvthead.points import PointLayout
 from cvthead.runtime.fill import ZERO
 from cvthead.runtime.ghosts import point_owners
-from cvthead.runtime.place import SEEN, SOFT_EDGE, coded, place
+from cvthead.runtime.place import SOFT_EDGE, coded, place
 from cvthead.runtime.seams import outline_rim
 from cvthead.source import network_input, places, portrait_pixels
+from cvthead.visibility import clear_points
 
 Array = NDArray[np.float32]
 
@@ -82,14 +83,12 @@ def imagined(
     """
     network = network_input(image, mask)
     at = places(layout, source_points, visible)
-    nearby = nearby_colours(layout, network, source_points, visible)
+    clear = clear_points(source_points, visible, mask)
+    hidden = hidden_colours(layout, network, source_points, clear)
     own = sampled(
         np.ascontiguousarray(network[:3].transpose(1, 2, 0)), to_pixels(source_points, len(mask))
     )
-    across = own.copy()
-    across[: layout.surface] = own[layout.mirror]
-    seen = at[:, 2:]
-    colours = np.where(seen == SEEN, own, np.where(seen > 0, across, nearby))
+    colours = np.where(clear[:, None], own, hidden)
     portrait = portrait_pixels(network)
     owners, rim = point_owners(at, visible), outline_rim(portrait)
     placed = place(layout, points, at, owners, rim, coded(colours, 1), portrait, size // 2)

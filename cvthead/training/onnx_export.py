@@ -42,10 +42,10 @@ class DescribeGraph(nn.Module):
         self.register_buffer("largest", largest)
 
     def forward(
-        self, source: Tensor, points: Tensor, visible: Tensor, anchor: Tensor, nearby: Tensor
+        self, source: Tensor, points: Tensor, clear: Tensor, anchor: Tensor, hidden: Tensor
     ) -> Tensor:
         """(b, p, C) uint8, ``largest`` (C,) of either sign on CODE_STEPS codes."""
-        descriptors = self.model.describe(source, points, visible, anchor, nearby) / self.largest
+        descriptors = self.model.describe(source, points, clear, anchor, hidden) / self.largest
         steps = (descriptors * CODE_STEPS).round().clamp(-CODE_STEPS, CODE_STEPS)
         return (steps + ZERO).to(torch.uint8)
 
@@ -163,9 +163,9 @@ def export_describe(model: CVTHead, largest: Tensor, path: Path) -> None:
     inputs = {
         "source": torch.rand(1, 4, CROP_PIXELS, CROP_PIXELS, generator=generator) * 2 - 1,
         "points": torch.rand(1, points, 3, generator=generator) * 2 - 1,
-        "visible": (torch.rand(1, points, generator=generator) > 0.5).float(),
+        "clear": (torch.rand(1, points, generator=generator) > 0.5).float(),
         "anchor": torch.randint(0, 1000, (1, MAX_SHELL_POINTS), generator=generator),
-        "nearby": torch.rand(1, points, 3, generator=generator) * 2 - 1,
+        "hidden": torch.rand(1, points, 3, generator=generator) * 2 - 1,
     }
     export_graph(DescribeGraph(folded(model), largest), inputs, path)
     with torch.inference_mode():

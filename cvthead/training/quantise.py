@@ -71,7 +71,7 @@ def quantise(
         codes = feed(placed)
         expected = to_codes(exact.run(None, codes)[0])
         found = small.run(None, {name: x.astype(np.uint8) for name, x in codes.items()})[0]
-        pictures = [mix(x[0], placed.warped, placed.reach) for x in (expected, found)]
+        pictures = [mix(x[0], placed) for x in (expected, found)]
         lowest = min(lowest, psnr(*pictures))
     if lowest < MIN_PSNR:
         raise AssetError(

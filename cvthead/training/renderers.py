@@ -37,7 +37,7 @@ class OpenRenderer(nn.Module):
         """RGB (b * VIEWS, 3, s, s) in [-1, 1] and mask logits (b * VIEWS, 1, s, s)."""
         descriptors = self.model.describe(*(batch[name] for name in DESCRIBE_INPUTS))
         return self.model.paint(
-            rearrange(batch["driven"], "b v p c -> (b v) p c"),
+            rearrange(batch["splatted"], "b v p c -> (b v) p c"),
             repeat(descriptors, "b p c -> (b v) p c", v=VIEWS),
             rearrange(batch["seen"], "b v p -> (b v) p"),
             rearrange(batch["warped"], "b v ... -> (b v) ..."),
