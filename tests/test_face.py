@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -56,6 +58,19 @@ def test_the_face_and_what_stands_beside_it_stay(pipeline: Pipeline, avatar: Ava
     assert (left[~gone] == points[~gone]).all()
     for kind in (Region.SHOULDERS, Region.EARS):
         assert gone[: len(region)][region == kind].mean() < 0.2
+
+
+def test_frames_are_placed_without_what_is_covered(pipeline: Pipeline, avatar: Avatar) -> None:
+    layout = pipeline.layout
+    marks = np.ones_like(avatar.descriptors)
+    marks[: layout.surface][layout.region == Region.MOUTH] = 255
+    marked = replace(avatar, descriptors=marks)
+    points = posed(pipeline, avatar, yaw=0.8)
+    placed = pipeline.place(marked, points)
+    owner = splat(splatted(layout, points, SIZE), SIZE // 2)
+    mouth = (owner >= 0) & (owner < layout.surface)
+    mouth[mouth] = layout.region[owner[mouth]] == Region.MOUTH
+    assert np.array_equal(placed.codes[owner >= 0][:, 1] == 255, mouth[owner >= 0])
 
 
 def test_the_throat_is_never_shown(pipeline: Pipeline, avatar: Avatar) -> None:

@@ -150,6 +150,13 @@ def test_few_visible_points_are_enough(
     found = hidden_colours(layout, source, points, clear)
     assert np.isfinite(found).all()
     assert found.any() == (shown > 0)
+    # The same of the face, whose points have counterparts.
+    clear = np.zeros(layout.total, np.bool_)
+    clear[np.flatnonzero(layout.region == Region.FACE)[:shown]] = True
+    found = hidden_colours(layout, source, points, clear)
+    assert np.isfinite(found).all()
+    assert (np.abs(found) <= 1).all()
+    assert found.any() == (shown > 0)
 
 
 def test_every_point_seen_leaves_nothing_to_guess(
