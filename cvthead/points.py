@@ -34,6 +34,7 @@ class PointLayout:
         detail_vertices: (V,) vertices of face, eyes and mouth.
         detail_faces: (F, 3) triangles between those, numbered within detail_vertices.
         face: (Q,) points of the face, without eyes and mouth.
+        inner: (I,) points of eyes and mouth.
         throat: (T,) points of the mouth that lie too deep to be seen.
     """
 
@@ -44,6 +45,7 @@ class PointLayout:
     detail_vertices: NDArray[np.int64]
     detail_faces: NDArray[np.int32]
     face: NDArray[np.intp]
+    inner: NDArray[np.intp]
     throat: NDArray[np.intp]
 
     @classmethod
@@ -70,6 +72,7 @@ class PointLayout:
             own.astype(np.int64),
             faces.reshape(-1, 3).astype(np.int32),
             np.flatnonzero(region == Region.FACE),
+            np.flatnonzero(np.isin(region, (Region.EYES, Region.MOUTH))),
             np.flatnonzero(deep),
         )
 

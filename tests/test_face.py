@@ -73,6 +73,21 @@ def test_frames_are_placed_without_what_is_covered(pipeline: Pipeline, avatar: A
     assert np.array_equal(placed.codes[owner >= 0][:, 1] == 255, mouth[owner >= 0])
 
 
+def test_nothing_is_lent_to_an_open_mouth(pipeline: Pipeline, avatar: Avatar) -> None:
+    """Its colours would be those of the lips around."""
+    points = posed(pipeline, avatar, jaw=0.35)
+    nowhere = avatar.places.copy()
+    nowhere[:, 2] = 0
+    lent = pipeline.place(replace(avatar, places=nowhere), points).lent
+    layout = pipeline.layout
+    owner = splat(splatted(layout, points, SIZE), SIZE // 2)
+    mouth = (owner >= 0) & (owner < layout.surface)
+    mouth[mouth] = np.isin(owner[mouth], layout.inner)
+    assert mouth.sum() > 50
+    assert lent[mouth].mean() < 0.6
+    assert lent[~mouth].mean() > 0.95
+
+
 def test_the_throat_is_never_shown(pipeline: Pipeline, avatar: Avatar) -> None:
     layout = pipeline.layout
     assert 0 < len(layout.throat) < (layout.region == Region.MOUTH).sum() / 2
