@@ -18,7 +18,7 @@ SURE = 0.8  # share of the points from which a place counts as seen
 
 
 def hidden_share(seen: NDArray[np.bool_], known: NDArray[np.bool_]) -> Array:
-    """How far each pixel of a splat is hidden; cvthead.model.light_unet does the same.
+    """How far each pixel of a splat is hidden.
 
     Args:
         seen: (s, s) the portrait sees the pixel's point.
