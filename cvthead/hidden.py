@@ -61,8 +61,7 @@ def hidden_colours(
     everything = np.flatnonzero(clear)
     if not len(everything):
         return out
-    image = np.ascontiguousarray(source[:3].transpose(1, 2, 0))
-    colours = sampled(image, to_pixels(points, len(image)))
+    colours = own_colours(source, points)
     bare = _bare(layout, colours, clear)
     shell = np.arange(layout.surface, len(points))
     kinds = [np.flatnonzero(np.isin(layout.region, kind)) for kind in KINDS]
@@ -141,6 +140,12 @@ def _mean(
     weight /= weight.sum(1, keepdims=True)
     mean = np.einsum("hk,hkc->hc", weight, values[lenders])
     return mean.astype(np.float32), lenders, distance[:, 0]
+
+
+def own_colours(source: Array, points: Array) -> Array:
+    """(P, 3) in -1..1 where each point lies in the picture; arguments as :func:`hidden_colours`."""
+    image = np.ascontiguousarray(source[:3].transpose(1, 2, 0))
+    return sampled(image, to_pixels(points, len(image)))
 
 
 def sampled(image: NDArray[Any], pixels: NDArray[np.floating]) -> Array:

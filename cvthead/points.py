@@ -34,7 +34,7 @@ class PointLayout:
         detail_vertices: (V,) vertices of face, eyes and mouth.
         detail_faces: (F, 3) triangles between those, numbered within detail_vertices.
         face: (Q,) points of the face, without eyes and mouth.
-        inner: (I,) points of eyes and mouth.
+        inner: (total,) bool, points of eyes and mouth.
         throat: (T,) points of the mouth that lie too deep to be seen.
     """
 
@@ -45,7 +45,7 @@ class PointLayout:
     detail_vertices: NDArray[np.int64]
     detail_faces: NDArray[np.int32]
     face: NDArray[np.intp]
-    inner: NDArray[np.intp]
+    inner: NDArray[np.bool_]
     throat: NDArray[np.intp]
 
     @classmethod
@@ -62,6 +62,7 @@ class PointLayout:
         own, faces = np.unique(head.faces[detail[head.faces].all(1)], return_inverse=True)
         region = np.concatenate([head.region, head.region[edges[:, 0]]])
         forward = np.concatenate([head.template[:, 2], head.template[edges, 2].mean(1)])
+        inner = np.isin(region, (Region.EYES, Region.MOUTH))
         mouth = region == Region.MOUTH
         deep = mouth & (forward < forward[mouth].max() - THROAT)
         return cls(
@@ -72,7 +73,7 @@ class PointLayout:
             own.astype(np.int64),
             faces.reshape(-1, 3).astype(np.int32),
             np.flatnonzero(region == Region.FACE),
-            np.flatnonzero(np.isin(region, (Region.EYES, Region.MOUTH))),
+            np.concatenate([inner, np.zeros(MAX_SHELL_POINTS, np.bool_)]),
             np.flatnonzero(deep),
         )
 

@@ -32,7 +32,11 @@ class Decimated:
 
 def components(count: int, faces: Ints) -> Ints:
     """(count,) label of each vertex's connected component."""
-    pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
+    return linked(count, np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]]))
+
+
+def linked(count: int, pairs: NDArray[np.integer]) -> Ints:
+    """(count,) label of each vertex's component, of edges (E, 2)."""
     graph = sparse.coo_array((np.ones(len(pairs)), pairs.T), shape=(count, count))
     return np.asarray(connected_components(graph, directed=False)[1]).astype(np.int64)
 

@@ -11,10 +11,8 @@ nearer where that lies too far back.
 
 from __future__ import annotations
 
-import argparse
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,12 +21,12 @@ from cvthead.avatar import Avatar
 from cvthead.deformation import to_pixels
 from cvthead.driving import drive
 from cvthead.evaluation.methods import Drawn
-from cvthead.evaluation.shots import Shot, read_take, rotation
-from cvthead.evaluation.videos import find_videos
+from cvthead.evaluation.shots import Shot, rotation
 from cvthead.head.model import Region
 from cvthead.pipeline import Pipeline
 from cvthead.silhouette import pixel_of
 from cvthead.visibility import visible_points
+from tools.clips import clip_arguments, clips
 from tools.st_lpips_parts import flow_between
 
 Array = NDArray[np.float64]
@@ -66,21 +64,14 @@ def residuals(
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(prog="python -m tools.depth_errors", description=__doc__)
-    parser.add_argument("data", type=Path, help="as `cvthead evaluate --data`")
-    parser.add_argument("--every", type=int, default=1, help="take every n-th clip")
-    parser.add_argument("--drivers", type=int, default=8, help="driving frames per clip")
+    parser = clip_arguments("python -m tools.depth_errors", __doc__, drivers=8)
     args = parser.parse_args(argv)
     pipeline = Pipeline.load()
     found: dict[str, list[tuple[Array, Array]]] = defaultdict(list)
-    for video in find_videos(args.data, None)[:: args.every]:
-        take = read_take(pipeline.tracker, video.path, video.name)
-        if take is None:
-            continue
-        avatar = pipeline.encode(take.source.image)
-        for number in take.spread(args.drivers):
-            driver = take.driver(pipeline.tracker, number)
-            for part, *values in residuals(pipeline, avatar, driver) if driver else ():
+    for shot, drivers in clips(pipeline.tracker, args):
+        avatar = pipeline.encode(shot.image)
+        for driver in drivers:
+            for part, *values in residuals(pipeline, avatar, driver):
                 found[part].append((values[0], values[1]))
     print("| | frames | motion left, pixels (x, y) | nearer by, mm (x) | of it explained |")
     print("| --- | ---: | ---: | ---: | ---: |")

@@ -32,12 +32,9 @@ from cvthead.model.cvthead import CVTHead
 from cvthead.model.splat import splat
 from cvthead.pipeline import Pipeline
 from cvthead.points import FAR_AWAY
-from cvthead.runtime.edges import continued
 from cvthead.runtime.face import splatted
-from cvthead.runtime.holes import without_holes
-from cvthead.runtime.lend import lend
+from cvthead.runtime.mix import composed
 from cvthead.runtime.model_folder import WEIGHTS, packaged
-from cvthead.runtime.place import COLOURS
 from cvthead.runtime.threads import one_thread_per_call
 from cvthead.source import Source, as_network_input, cut_head, read_source
 from cvthead.training.static_int8 import psnr
@@ -101,15 +98,9 @@ class FloatNetwork:
         # Beside sharp edges the filter over what is painted overshoots.
         colour, opaque = ((painted + 1) * 127.5).clamp(0, 255), logits.sigmoid() * 255
         exact = torch.cat([colour, opaque], dim=1)[0].permute(1, 2, 0).round().to(torch.uint8)
-        lent = lend(exact.numpy(), placed.codes[..., COLOURS], placed.lent)
-        shown = gate[0, 0].numpy()
-        rgba = cv2.blendLinear(placed.warped, lent, shown, 1 - shown)
-        # Beyond the points no network is asked.
-        alpha = np.minimum(lent[..., 3], placed.reach)
-        rgba[..., 3] = alpha
-        out = continued(np.asarray(rgba, np.uint8))
-        out[..., 3] = without_holes(alpha, placed.reach)
-        return Frame.of_rgba(out)
+        rgba = exact.numpy()
+        alpha = np.ascontiguousarray(rgba[..., 3])
+        return Frame.of_rgba(composed(rgba, alpha, gate[0, 0].numpy(), placed))
 
 
 def compare(network: FloatNetwork, portrait: Path) -> tuple[Grid, list[float]]:

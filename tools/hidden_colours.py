@@ -9,32 +9,23 @@ it is, the nearest points alone, and what cvthead.hidden makes of both.
 
 from __future__ import annotations
 
-import argparse
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cvthead.deformation import to_pixels
-from cvthead.evaluation.shots import Shot, read_take
-from cvthead.evaluation.videos import find_videos
+from cvthead.evaluation.shots import Shot
 from cvthead.head.model import Region
-from cvthead.hidden import hidden_colours, sampled
+from cvthead.hidden import hidden_colours, own_colours
 from cvthead.pipeline import Pipeline
 from cvthead.source import Source, read_source
+from tools.clips import clip_arguments, clips
 
 Array = NDArray[np.float32]
 
 PARTS = ("FACE", "EARS", "NECK", "SCALP", "SHOULDERS")
-
-
-def colours(source: Source) -> Array:
-    """(P, 3) in -1..1 where each point lies in the picture."""
-    image = np.ascontiguousarray(source.network_input[:3].transpose(1, 2, 0))
-    return sampled(image, to_pixels(source.points, len(image)))
 
 
 def guesses(pipeline: Pipeline, source: Source) -> dict[str, Array]:
@@ -43,7 +34,7 @@ def guesses(pipeline: Pipeline, source: Source) -> dict[str, Array]:
     alone = replace(layout, mirror=np.arange(layout.surface, dtype=np.int32))
     given = source.network_input, source.points, source.clear
     return {
-        "across": colours(source)[layout.mirror],
+        "across": own_colours(source.network_input, source.points)[layout.mirror],
         "nearest": hidden_colours(alone, *given)[: layout.surface],
         "both": hidden_colours(layout, *given)[: layout.surface],
     }
@@ -55,7 +46,7 @@ def compared(
     """Squared errors, by part, whether the source shows the point across, and guess."""
     layout = pipeline.layout
     shown = read_source(pipeline.deformer, layout, driver.head)
-    true = colours(shown)[: layout.surface]
+    true = own_colours(shown.network_input, shown.points)[: layout.surface]
     seen = (shown.clear & ~source.clear)[: layout.surface]
     across = source.clear[layout.mirror]
     out = {}
@@ -69,21 +60,14 @@ def compared(
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(prog="python -m tools.hidden_colours", description=__doc__)
-    parser.add_argument("data", type=Path, help="as `cvthead evaluate --data`")
-    parser.add_argument("--every", type=int, default=1, help="take every n-th clip")
-    parser.add_argument("--drivers", type=int, default=4, help="driving frames per clip")
+    parser = clip_arguments("python -m tools.hidden_colours", __doc__, drivers=4)
     args = parser.parse_args(argv)
     pipeline = Pipeline.load()
     found: dict[tuple[str, bool, str], list[Array]] = defaultdict(list)
-    for video in find_videos(args.data, None)[:: args.every]:
-        take = read_take(pipeline.tracker, video.path, video.name)
-        if take is None:
-            continue
-        source = read_source(pipeline.deformer, pipeline.layout, take.source.head)
-        for number in take.spread(args.drivers):
-            driver = take.driver(pipeline.tracker, number)
-            for key, errors in compared(pipeline, source, driver).items() if driver else ():
+    for shot, drivers in clips(pipeline.tracker, args):
+        source = read_source(pipeline.deformer, pipeline.layout, shot.head)
+        for driver in drivers:
+            for key, errors in compared(pipeline, source, driver).items():
                 found[key].append(errors)
     print("| hidden points | number | across | nearest | both |")
     print("| --- | ---: | ---: | ---: | ---: |")

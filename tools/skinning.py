@@ -7,11 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 
 from cvthead.head.mesh import edges
 from cvthead.head.model import Region
+from tools.decimate import linked
 from tools.makehuman import MakeHuman
 from tools.topology import Part
 
@@ -87,9 +86,8 @@ def regions(
 def scalp_in_one_piece(region: NDArray[np.uint8], faces: NDArray[np.integer]) -> NDArray[np.uint8]:
     """(N,) without the few vertices under the ears that would be islands of hair in the neck."""
     scalp = np.flatnonzero(region == Region.SCALP)
-    one, other = edges(faces.astype(np.int32)).T
-    links = sparse.coo_array((np.ones(len(one)), (one, other)), shape=(len(region),) * 2)
-    _, piece = connected_components(links.tocsr()[scalp][:, scalp], directed=False)
+    pairs = edges(faces.astype(np.int32))
+    piece = linked(len(region), pairs[(region[pairs] == Region.SCALP).all(axis=1)])[scalp]
     out = region.copy()
     out[scalp[piece != np.bincount(piece).argmax()]] = Region.NECK
     return out

@@ -10,7 +10,6 @@ on white by the target's mask, as in `cvthead evaluate`.
 
 from __future__ import annotations
 
-import argparse
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,11 +21,11 @@ from numpy.typing import NDArray
 
 from cvthead.evaluation.methods import Drawn, trained
 from cvthead.evaluation.metrics import Picture, on_white, tensor
-from cvthead.evaluation.shots import Image, Shot, read_take
-from cvthead.evaluation.videos import find_videos
+from cvthead.evaluation.shots import Image, Shot
 from cvthead.head.model import HeadModel
 from cvthead.pipeline import Pipeline
 from cvthead.training.perceptual import STLPIPS
+from tools.clips import clip_arguments, clips
 
 CHIN = 152  # of the face-mesh landmarks
 BLURS = (0.5, 0.7, 1.0)  # sigma in pixels
@@ -87,25 +86,16 @@ def pictures(head: HeadModel, source: Shot, driver: Shot, drawn: Drawn) -> dict[
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(prog="python -m tools.st_lpips_parts", description=__doc__)
-    parser.add_argument("data", type=Path, help="as `cvthead evaluate --data`")
-    parser.add_argument("--every", type=int, default=1, help="take every n-th clip")
-    parser.add_argument("--drivers", type=int, default=3, help="driving frames per clip")
+    parser = clip_arguments("python -m tools.st_lpips_parts", __doc__, drivers=3)
     parser.add_argument("--model", type=Path, help="another model folder than the packaged one")
     args = parser.parse_args(argv)
     pipeline = Pipeline.load(model=args.model)
     prepare, distance = trained(pipeline), STLPIPS("alex")
     found: dict[str, list[float]] = defaultdict(list)
-    for video in find_videos(args.data, None)[:: args.every]:
-        take = read_take(pipeline.tracker, video.path, video.name)
-        if take is None:
-            continue
-        person = prepare(take.source)
-        for number in take.spread(args.drivers):
-            driver = take.driver(pipeline.tracker, number)
-            if driver is None:
-                continue
-            shown = pictures(pipeline.head, take.source, driver, person.follow(driver))
+    for shot, drivers in clips(pipeline.tracker, args):
+        person = prepare(shot)
+        for driver in drivers:
+            shown = pictures(pipeline.head, shot, driver, person.follow(driver))
             wanted = tensor([on_white(driver.head.image, driver.head.mask)]) * 2 - 1
             with torch.no_grad():
                 for name, picture in shown.items():

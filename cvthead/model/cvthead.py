@@ -75,6 +75,7 @@ class CVTHead(nn.Module):
             (b, p, C) float32.
         """
         tokens, pixels = self.encoder(source)
+        lent: Tensor | None = hidden
         if self.config.features == "pixel-aligned":
             size = self.config.upsampler_sizes[-1]
             vertex = points.new_zeros(len(points), self.fusion.vertex_embedding.shape[0], size)
@@ -84,14 +85,13 @@ class CVTHead(nn.Module):
             x = self.transformer(x)[:, : len(self.coarse)]
             vertex = self.upsampler(x)  # b n f
             if self.config.features == "transformer":
-                clear = torch.zeros_like(clear)
+                clear, lent = torch.zeros_like(clear), None
         embedding = self.fusion.vertex_embedding.expand(len(source), -1, -1)
         feature = self._spread(vertex, anchor)
         embedding = self._spread(embedding, anchor)
         embedding[:, -anchor.shape[1] :] += self.fusion.shell_embedding
         shell = torch.arange(len(self.mirror), points.shape[1], device=self.mirror.device)
         mirror = torch.cat([self.mirror, shell])
-        lent = None if self.config.features == "transformer" else hidden
         out: Tensor = self.fusion(
             feature, embedding, pixels.float(), source, points, clear, mirror, lent
         )

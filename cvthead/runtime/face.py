@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvthead.points import FAR_AWAY, SEEN, SEEN_MIRRORED, PointLayout
+from cvthead.runtime.splat import pixel_along
 from cvthead.runtime.triangles import FAR, rasterise
 
 Array = NDArray[np.float32]
@@ -88,10 +89,7 @@ def without_covered(layout: PointLayout, points: Array, depth: Array) -> Array:
     """
     size = len(depth)
     x, y, z = np.ascontiguousarray(points.T)
-    column, row = (
-        ((each * np.float32(0.5) + np.float32(0.5)) * size).clip(0, size - 1).astype(np.intp)
-        for each in (x, y)
-    )
+    column, row = (pixel_along(each, size).clip(0, size - 1) for each in (x, y))
     covered = z > depth.ravel()[row * size + column] + np.float32(COVER)
     covered[layout.face] = False
     covered[layout.throat] = True

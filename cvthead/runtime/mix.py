@@ -40,14 +40,29 @@ def mix(codes: Codes, placed: Placed) -> Codes:
     fours = codes.view(np.uint32)  # a block's four pixels, then its four gates
     pixels = shuffled(np.ascontiguousarray(fours[..., :GATES]))
     painted = evened(pixels.view(np.uint8).reshape(placed.warped.shape))
-    painted = lend(painted, placed.codes[..., COLOURS], placed.lent)
+    alpha = cv2.LUT(cv2.extractChannel(painted, 3), ALPHA)
     gates = shuffled(np.ascontiguousarray(fours[..., GATES:]).view(np.uint8))
-    gate = cv2.LUT(evened(gates), GATE)
+    gate = np.asarray(cv2.LUT(evened(gates), GATE), np.float32)
+    return composed(painted, np.asarray(alpha, np.uint8), gate, placed)
+
+
+def composed(painted: Codes, alpha: Codes, gate: NDArray[np.float32], placed: Placed) -> Codes:
+    """The frame of what is painted and what is carried.
+
+    Args:
+        painted: (2s, 2s, 4) of which RGB counts; alpha: (2s, 2s); gate: (2s, 2s) 0..1, how far the
+            carried portrait is shown instead.
+        placed: what the network was given.
+
+    Returns:
+        (2s, 2s, 4) as :func:`mix`.
+    """
+    painted = lend(painted, placed.codes[..., COLOURS], placed.lent)
     out = cv2.blendLinear(placed.warped, painted, gate, 1 - gate)
-    alpha = cv2.min(cv2.LUT(cv2.extractChannel(painted, 3), ALPHA), placed.reach)
+    alpha = np.asarray(cv2.min(alpha, placed.reach), np.uint8)  # beyond it no network is asked
     cv2.insertChannel(alpha, out, 3)
     out = continued(np.asarray(out, np.uint8))
-    cv2.insertChannel(without_holes(np.asarray(alpha, np.uint8), placed.reach), out, 3)
+    cv2.insertChannel(without_holes(alpha, placed.reach), out, 3)
     return out
 
 

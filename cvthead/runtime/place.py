@@ -124,20 +124,11 @@ def place(
     filled, codes[..., -FILL_LEVELS:] = fill(values.reshape(size, size, -1), known)
     codes[..., : filled.shape[2]] = filled
     codes[..., filled.shape[2]] = np.rint(seen * 255)
-    sure = seen == SEEN  # nothing is lent there
-    sure.ravel()[drawn] |= inner(layout, front)
+    # Nothing is lent to what is seen, nor to eyes and mouth: the frame network has seen many open
+    # that were shut in the portrait, so it knows better than the colours around.
+    sure = seen == SEEN
+    sure.ravel()[drawn] |= layout.inner[front]
     return Placed(codes, warped, reach_of(covered, warped), hidden_share(sure, known))
-
-
-def inner(layout: PointLayout, numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Whether points, by their numbers (N,), are of eyes or mouth.
-
-    The frame network has seen many open that were shut in the portrait, so it knows better than
-    the colours around.
-    """
-    within = np.zeros(layout.total, np.bool_)
-    within[layout.inner] = True
-    return within[numbers]
 
 
 def coded(values: Array, largest: float) -> Codes:

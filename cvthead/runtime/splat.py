@@ -27,7 +27,7 @@ def splat(points: Array, size: int) -> NDArray[np.int64]:
         higher number wins.
     """
     x, y, depth = np.ascontiguousarray(points.T)
-    column, row = _pixel(x, size), _pixel(y, size)
+    column, row = pixel_along(x, size), pixel_along(y, size)
     inside = np.nonzero((column >= 0) & (column < size) & (row >= 0) & (row < size))[0]
     column, row, depth = column[inside], row[inside], depth[inside]
     block = row // BLOCK * (size // BLOCK) + column // BLOCK
@@ -60,7 +60,7 @@ def front_points(pixel: NDArray[np.int64], depth: Array, count: int) -> NDArray[
     return np.where(first == NOTHING, EMPTY, -first & NUMBER)
 
 
-def _pixel(coordinate: Array, size: int) -> NDArray[np.int64]:
+def pixel_along(coordinate: Array, size: int) -> NDArray[np.int64]:
     place = (coordinate * np.float32(0.5) + np.float32(0.5)) * np.float32(size)
     return np.asarray(np.floor(place), np.int64)
 

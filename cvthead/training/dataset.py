@@ -203,10 +203,11 @@ class PairDataset(Dataset[dict[str, Tensor]]):
             "weight": np.stack(weights),
             "background": np.full((VIEWS, 3, 1, 1), 1, np.float32) * rng.random((1, 3, 1, 1)),
             "driven": np.stack(driven),
-            "splatted": np.stack([splatted(self.layout, each, self.size) for each in driven]),
             "warped": np.stack([as_network_input(each.warped) for each in placed]),
             **targets(views, self.size),
         }
+        if not self.whole:
+            stack["splatted"] = np.stack([splatted(self.layout, d, self.size) for d in driven])
         return {
             name: torch.from_numpy(
                 np.ascontiguousarray(value if name == "anchor" else value.astype(np.float32))

@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from cvthead.camera import Camera
 from cvthead.coefficients import Coefficients
 from cvthead.crop import head_crop
-from cvthead.deformation import to_pixels
 from cvthead.driving import at_neck
 from cvthead.head.model import HeadModel
-from cvthead.hidden import hidden_colours, sampled
+from cvthead.hidden import hidden_colours, own_colours
 from cvthead.points import PointLayout
 from cvthead.runtime.fill import ZERO
 from cvthead.runtime.ghosts import point_owners
@@ -85,10 +84,7 @@ def imagined(
     at = places(layout, source_points, visible)
     clear = clear_points(source_points, visible, mask)
     hidden = hidden_colours(layout, network, source_points, clear)
-    own = sampled(
-        np.ascontiguousarray(network[:3].transpose(1, 2, 0)), to_pixels(source_points, len(mask))
-    )
-    colours = np.where(clear[:, None], own, hidden)
+    colours = np.where(clear[:, None], own_colours(network, source_points), hidden)
     portrait = portrait_pixels(network)
     owners, rim = point_owners(at, visible), outline_rim(portrait)
     placed = place(layout, points, at, owners, rim, coded(colours, 1), portrait, size // 2)
