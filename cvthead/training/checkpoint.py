@@ -39,6 +39,7 @@ class RunState:
         step: steps done.
         running: smoothed losses of this process's batches.
         best: lowest ST-LPIPS on the validation records so far.
+        began_with: fingerprint of the weights that the run started from; empty: random ones.
     """
 
     model: nn.Module
@@ -49,6 +50,7 @@ class RunState:
     step: int = 0
     running: dict[str, float] = field(default_factory=dict)
     best: float = math.inf
+    began_with: str = ""
 
     def parts(self) -> dict[str, Any]:
         """By name, those with a state_dict."""
@@ -74,6 +76,7 @@ def save(path: Path, fabric: Fabric, config: TrainConfig, state: RunState) -> No
             "step": state.step,
             "running": state.running,
             "best": state.best,
+            "began_with": state.began_with,
             "config": config.fixed(),
         }
         temporary = path.with_suffix(".tmp")
@@ -115,7 +118,9 @@ def resume(path: Path, fabric: Fabric, config: TrainConfig, state: RunState) -> 
     for name, part in state.parts().items():
         part.load_state_dict(contents[name])
     state.step, state.running = contents["step"], contents["running"]
-    state.best = contents.get("best", math.inf)  # absent from checkpoints of earlier versions
+    # Absent from checkpoints of earlier versions.
+    state.best = contents.get("best", math.inf)
+    state.began_with = contents.get("began_with", "")
 
 
 def start_from(config: TrainConfig, state: RunState) -> None:
@@ -137,12 +142,13 @@ def start_from(config: TrainConfig, state: RunState) -> None:
         )
     if path.suffix == ".safetensors":
         try:
-            weights.load_into(state.model, path)
+            state.began_with = weights.load_into(state.model, path)
         except AssetError as error:
             raise InputError(f"{path} holds another network", hint=ANOTHER_NETWORK) from error
     else:
         contents = read(path)
         _load(state.model, contents["model"], path)
+        state.began_with = weights.fingerprint(contents["model"])
         if state.discriminator is not None and "discriminator" in contents:
             state.discriminator.load_state_dict(contents["discriminator"])
     state.averaged.module.load_state_dict(state.model.state_dict())

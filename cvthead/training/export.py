@@ -9,6 +9,7 @@ networks ``describe.onnx`` and ``paint.onnx`` made from it, and ``model.json``.
 from __future__ import annotations
 
 import argparse
+import json
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -51,6 +52,7 @@ CALIBRATION, HELD_OUT = 32, 16
 SPLAT_SIZE = CROP_PIXELS // OPEN.unet_unshuffle
 SEED = 2  # of the calibration samples
 NOTES = ("licence", "data")
+PATHS = {"data", "labels", "model", "tables"}  # settings that say nothing elsewhere
 DESCRIPTOR_SHARE = 0.9999  # the rest is clipped to the largest code
 FEATURE_SHARE = 0.9999
 
@@ -166,10 +168,13 @@ def export(
     """
     state = read(checkpoint)
     model = averaged_model(state)
-    deform = state.get("config", {}).get("deformation", True)
+    config = state.get("config", {})
+    deform = config.get("deformation", True)
     training = {
         "step": str(state["step"]),
-        "seed": str(state.get("config", {}).get("seed", "unknown")),
+        "seed": str(config.get("seed", "unknown")),
+        "began_with": state.get("began_with") or "random weights",
+        "settings": json.dumps({name: config[name] for name in sorted(config.keys() - PATHS)}),
         "features": model.config.features,
         "deformation": str(deform).lower(),
         "records_sha256": records_hash(records),
