@@ -28,6 +28,7 @@ class PointLayout:
 
     Attributes:
         vertices: N, mesh vertices.
+        faces: (T, 3) triangles over the mesh vertices.
         edges: (D, 2) end vertices of each midpoint.
         mirror: (N + D,) the mirrored counterpart of each point.
         region: (N + D,) Region of each point; a midpoint has its first vertex's.
@@ -39,6 +40,7 @@ class PointLayout:
     """
 
     vertices: int
+    faces: NDArray[np.int32]
     edges: NDArray[np.int32]
     mirror: NDArray[np.int32]
     region: NDArray[np.integer]
@@ -67,6 +69,7 @@ class PointLayout:
         deep = mouth & (forward < forward[mouth].max() - THROAT)
         return cls(
             count,
+            head.faces,
             edges.astype(np.int32),
             mirror.astype(np.int32),
             region,

@@ -166,7 +166,7 @@ def read_source(
         visible = clear = np.ones(len(projected), np.bool_)
     else:
         mask = eroded(head.mask, 1)
-        visible = visible_points(layout, model.faces, projected, mask, head.camera.scale)
-        clear = clear_points(projected, visible, head.mask)
+        visible = visible_points(layout, projected, mask, head.camera.scale)
+        clear = clear_points(layout, projected, visible, head.mask)
     drawn = on_person(projected, head.mask)
     return Source(head, deformation, projected, visible, clear, drawn)

@@ -25,13 +25,13 @@ MASK_LEVEL = 0.5
 MARGIN = 1.0  # pixels
 # Pixels of the 256 x 256 crop beside the outline, where the person is mixed with the background.
 RIM = 4
+EDGE_ON = 0.3  # cosine up to which a colour that is lent is nearer to the true one than the own
 ROUNDS = 2
 UNDECIDED = 0.1  # of the neighbours, more or less than half: the vertex's own answer stays
 
 
 def visible_points(
     layout: PointLayout,
-    faces: NDArray[np.int32],
     points: NDArray[np.float32],
     mask: NDArray[np.float32],
     scale: float,
@@ -40,7 +40,6 @@ def visible_points(
 
     Args:
         layout: numbering of the points.
-        faces: (F, 3) triangles over the mesh vertices.
         points: (P, 3) normalised projections, those of the shell as many as there are.
         mask: (S, S) person mask of the crop, 0..1, 0 beyond the picture.
         scale: of the normalised camera, normalised units per metre.
@@ -49,27 +48,26 @@ def visible_points(
         (P,) bool.
     """
     shown = inside_mask(points, mask)
-    found = _in_front(points, scale) & _facing(layout, faces, points) & shown
-    return agreed(layout, faces, found) & shown
+    facing = towards_camera(layout, points) > -GRAZING
+    found = _in_front(points, scale) & facing & shown
+    return agreed(layout, found) & shown
 
 
-def agreed(
-    layout: PointLayout, faces: NDArray[np.int32], visible: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
+def agreed(layout: PointLayout, visible: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Single vertices follow their neighbours on the mesh, and midpoints the ends of their edge.
 
     At the rim of what the portrait shows, the coarse z-buffer says now yes, now no; in a turned
     head that would be specks.
 
     Args:
-        layout, faces: as for :func:`visible_points`.
+        layout: numbering of the points.
         visible: (P,).
 
     Returns:
         (P,), shell points as they were.
     """
     out, count = visible.copy(), layout.vertices
-    one, other = mesh_edges(faces).T
+    one, other = mesh_edges(layout.faces).T
     neighbours = np.bincount(one, minlength=count) + np.bincount(other, minlength=count)
     own = out[:count]
     for _ in range(ROUNDS):
@@ -89,19 +87,24 @@ def inside_mask(points: NDArray[np.float32], mask: NDArray[np.float32]) -> NDArr
 
 
 def clear_points(
-    points: NDArray[np.float32], visible: NDArray[np.bool_], mask: NDArray[np.float32]
+    layout: PointLayout,
+    points: NDArray[np.float32],
+    visible: NDArray[np.bool_],
+    mask: NDArray[np.float32],
 ) -> NDArray[np.bool_]:
-    """Visible points clear of the person's outline, so that the colour there is their own.
+    """Visible points clear of the person's outline and not seen edge-on, so that the colour there
+    is their own: where a cheek turns away, an error of a pixel hits the collar behind it.
 
     Args:
-        points: (P, 3) normalised projections.
+        layout, points: as for :func:`visible_points`.
         visible: (P,).
         mask: (S, S) person mask of the crop, 0..1.
 
     Returns:
         (P,) bool.
     """
-    return visible & inside_mask(points, eroded(mask, RIM))
+    inside = inside_mask(points, eroded(mask, RIM))
+    return visible & inside & (towards_camera(layout, points) > EDGE_ON)
 
 
 def on_person(points: NDArray[np.float32], mask: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -132,17 +135,16 @@ def _in_front(points: NDArray[np.float32], scale: float) -> NDArray[np.bool_]:
     return np.asarray(points[:, 2] <= nearest[index] + DEPTH_TOLERANCE * scale)
 
 
-def _facing(
-    layout: PointLayout, faces: NDArray[np.int32], points: NDArray[np.float32]
-) -> NDArray[np.bool_]:
+def towards_camera(layout: PointLayout, points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(P,) cosine between each point's outward normal and the way to the camera, 1 for points of
+    the shell, which have none; arguments as :func:`visible_points`."""
     vertices = points[: layout.vertices]
     # In image axes (y down, depth away) an outward normal towards the camera has negative z.
-    towards = -vertex_normals(vertices, faces)[:, 2]
-    a, b = layout.edges.T
-    facing = np.ones(len(points), dtype=bool)
-    facing[: layout.vertices] = towards > -GRAZING
-    facing[layout.vertices : layout.surface] = (towards[a] + towards[b]) / 2 > -GRAZING
-    return facing
+    towards = -vertex_normals(vertices, layout.faces)[:, 2]
+    out = np.ones(len(points), np.float32)
+    out[: layout.vertices] = towards
+    out[layout.vertices : layout.surface] = towards[layout.edges].mean(1)
+    return out
 
 
 def eroded(mask: NDArray[np.float32], pixels: int) -> NDArray[np.float32]:

@@ -83,7 +83,7 @@ def test_the_rim_of_the_person_lends_no_colour(layout: PointLayout) -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform(-0.48, 0.48, (layout.total, 3)).astype(np.float32)
     visible = rng.random(layout.total) < 0.3
-    clear = clear_points(points, visible, source[3])
+    clear = clear_points(layout, points, visible, source[3])
     assert 0 < clear.sum() < visible.sum()
     found = hidden_colours(layout, source, points, clear)
     assert (found != 0).any()

@@ -41,7 +41,7 @@ def test_single_vertices_follow_their_neighbours(pipeline: Pipeline, layout: Poi
     flipped = rng.choice(layout.surface, 150, replace=False)
     specked[flipped] ^= True
     assert lonely(faces, specked[:count]) > 20
-    found = agreed(layout, faces, specked)
+    found = agreed(layout, specked)
     assert lonely(faces, found[:count]) < 5
     # The border between the halves stays where it is, give or take a vertex.
     assert (found != clean)[: layout.surface].mean() < 0.01
@@ -59,7 +59,7 @@ def test_nothing_faint_is_kept_far_from_the_person(pipeline: Pipeline, source: S
 
 def test_shell_points_have_no_neighbours(pipeline: Pipeline, layout: PointLayout) -> None:
     visible = np.random.default_rng(0).random(layout.total) < 0.5
-    found = agreed(layout, pipeline.head.faces, visible)
+    found = agreed(layout, visible)
     assert (found[layout.surface :] == visible[layout.surface :]).all()
 
 

@@ -47,7 +47,7 @@ def residuals(
     pictures = shown.on_white, Drawn(target.image, target.mask).on_white
     there, back = flow_between(*pictures), flow_between(*pictures[::-1])
     both = np.minimum(shown.alpha, target.mask)
-    visible = visible_points(pipeline.layout, pipeline.head.faces, points, both, camera.scale)
+    visible = visible_points(pipeline.layout, points, both, camera.scale)
     pixels, size = to_pixels(points), len(there)
     _, column, row = pixel_of(pixels, size)
     flow = there[row, column]

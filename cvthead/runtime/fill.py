@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -13,15 +15,26 @@ FILL_LEVELS = 3
 ZERO = 128  # the code of 0
 
 
-def fill(values: Codes, known: NDArray[np.bool_]) -> tuple[Codes, Codes]:
+class Filled(NamedTuple):
+    """A splat without holes.
+
+    Attributes:
+        values: (s, s, C) codes.
+        coverage: (s, s, 3) of each level's blocks, 0..255.
+        part: (s, s) 0..1, how far the values are those of pixels that are known; the rest is ZERO.
+    """
+
+    values: Codes
+    coverage: Codes
+    part: Array
+
+
+def fill(values: Codes, known: NDArray[np.bool_]) -> Filled:
     """A hole takes the average of what its 2, 4, 8 pixel block knows, or ZERO.
 
     Args:
         values: (s, s, C) codes, 0 where not known; s is a multiple of 8.
         known: (s, s).
-
-    Returns:
-        Filled (s, s, C), and the coverage of each level's blocks (s, s, 3), 0..255.
     """
     size = known.shape[0]
     total, count = values.astype(np.uint16), known.astype(np.uint16)
@@ -35,13 +48,17 @@ def fill(values: Codes, known: NDArray[np.bool_]) -> tuple[Codes, Codes]:
         mean: Array = np.asarray(total * share_inverse[..., None], np.float32)
         pulled.append((mean, (count > 0)[..., None]))
     out = np.full_like(mean, ZERO)
+    part = np.zeros(mean.shape[:2], np.float32)
     for mean, some in reversed(pulled):
-        coarse = cv2.resize(out, mean.shape[:2], interpolation=cv2.INTER_LINEAR)
+        sides = mean.shape[:2]
+        coarse = cv2.resize(out, sides, interpolation=cv2.INTER_LINEAR)
         out = np.where(some, mean, coarse.reshape(mean.shape))
+        part = np.where(some[..., 0], 1, cv2.resize(part, sides, interpolation=cv2.INTER_LINEAR))
     small = np.rint(out).astype(np.uint8)
     large = cv2.resize(small, (size, size), interpolation=cv2.INTER_LINEAR)
     filled = cv2.copyTo(values, known.view(np.uint8), large.reshape(values.shape))
-    return np.asarray(filled, np.uint8), coverage
+    part = cv2.resize(part, (size, size), interpolation=cv2.INTER_LINEAR)
+    return Filled(np.asarray(filled, np.uint8), coverage, np.where(known, np.float32(1), part))
 
 
 def _quarters(a: NDArray[np.uint16]) -> NDArray[np.uint16]:

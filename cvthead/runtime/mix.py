@@ -57,7 +57,7 @@ def composed(painted: Codes, alpha: Codes, gate: NDArray[np.float32], placed: Pl
     Returns:
         (2s, 2s, 4) as :func:`mix`.
     """
-    painted = lend(painted, placed.codes[..., COLOURS], placed.lent)
+    painted = lend(painted, placed.codes[..., COLOURS], placed.lent, placed.part)
     out = cv2.blendLinear(placed.warped, painted, gate, 1 - gate)
     alpha = np.asarray(cv2.min(alpha, placed.reach), np.uint8)  # beyond it no network is asked
     cv2.insertChannel(alpha, out, 3)

@@ -49,12 +49,14 @@ class Placed(NamedTuple):
         warped: (2s, 2s, 4) uint8, the portrait carried to the driven pose.
         reach: (2s, 2s) uint8, highest alpha; see :func:`reach_of`.
         lent: (s, s) of cvthead.runtime.lend.hidden_share.
+        part: (s, s) of cvthead.runtime.fill.Filled.
     """
 
     codes: Codes
     warped: Codes
     reach: Codes
     lent: Array
+    part: Array
 
     def without_lending(self) -> Placed:
         """For the transformer alone, which chooses all colours itself: an ablation."""
@@ -121,14 +123,16 @@ def place(
     warped = warp(portrait, flow)
     take_out(warped, ghost, seam, refined)
     codes = np.empty((size, size, code_size(descriptors.shape[1])), np.uint8)
-    filled, codes[..., -FILL_LEVELS:] = fill(values.reshape(size, size, -1), known)
-    codes[..., : filled.shape[2]] = filled
-    codes[..., filled.shape[2]] = np.rint(seen * 255)
+    filled = fill(values.reshape(size, size, -1), known)
+    codes[..., : -FILL_LEVELS - 1] = filled.values
+    codes[..., -FILL_LEVELS - 1] = np.rint(seen * 255)
+    codes[..., -FILL_LEVELS:] = filled.coverage
     # Nothing is lent to what is seen, nor to eyes and mouth: the frame network has seen many open
     # that were shut in the portrait, so it knows better than the colours around.
     sure = seen == SEEN
     sure.ravel()[drawn] |= layout.inner[front]
-    return Placed(codes, warped, reach_of(covered, warped), hidden_share(sure, known))
+    share = hidden_share(sure, known)
+    return Placed(codes, warped, reach_of(covered, warped), share, filled.part)
 
 
 def coded(values: Array, largest: float) -> Codes:

@@ -186,7 +186,7 @@ class PairDataset(Dataset[dict[str, Tensor]]):
             np.maximum(detail_weights(marks, self.size), unseen_weights(each))[None]
             for marks, each in zip(landmarks, placed, strict=True)
         ]
-        clear = clear_points(own, visible > 0, network[3])
+        clear = clear_points(self.layout, own, visible > 0, network[3])
         hidden = hidden_colours(self.layout, network, own, clear)
         if self.all_seen:
             visible, clear = np.ones_like(visible), np.ones_like(clear)

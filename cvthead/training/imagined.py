@@ -82,7 +82,7 @@ def imagined(
     """
     network = network_input(image, mask)
     at = places(layout, source_points, visible)
-    clear = clear_points(source_points, visible, mask)
+    clear = clear_points(layout, source_points, visible, mask)
     hidden = hidden_colours(layout, network, source_points, clear)
     colours = np.where(clear[:, None], own_colours(network, source_points), hidden)
     portrait = portrait_pixels(network)
