@@ -1,7 +1,8 @@
 """tools/latency_plot.py and tools/footprint.py: what they print, not how fast it is; and
 tools/st_lpips_parts.py: that what it replaces or moves lies nearer to the target; and
 tools/depth_errors.py: that it finds the depth by which a head was made too flat; and
-tools/hidden_colours.py: that it compares what is hidden alone, with its true colour."""
+tools/hidden_colours.py and tools/edge_on_colours.py: that they compare what they name alone, with
+its true colour."""
 
 from __future__ import annotations
 
@@ -24,6 +25,7 @@ from cvthead.head.model import Region
 from cvthead.images import read_image
 from cvthead.sample import SAMPLE
 from cvthead.source import read_source
+from tools import edge_on_colours
 from tools.depth_errors import residuals
 from tools.footprint import base_dependencies, resident_bytes, service_lines
 from tools.hidden_colours import compared, guesses
@@ -153,3 +155,17 @@ def test_hidden_colours_are_compared_with_what_is_there(pipeline: Pipeline, shot
     guessed = guesses(pipeline, whole)
     assert not guessed["both"][shown].any()
     assert guessed["nearest"][~shown].any(1).mean() > 0.9
+
+
+def test_edge_on_colours_are_compared_where_a_driver_shows_them(
+    pipeline: Pipeline, shot: Shot
+) -> None:
+    """A portrait is compared with itself: it believes itself from FRONTAL on."""
+    source = read_source(pipeline.deformer, pipeline.layout, shot.head)
+    rows = list(edge_on_colours.compared(pipeline, source, [shot]))
+    for (_, high), _, errors in rows:
+        assert errors.size == 0 or high > edge_on_colours.FRONTAL
+    face = {low: errors for (low, _), part, errors in rows if part == "FACE"}[0.4]
+    assert len(face) > 50
+    assert not face[:, 0].any()
+    assert face[:, 1].all()

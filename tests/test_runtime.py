@@ -69,14 +69,26 @@ def test_fill_is_the_one_the_network_was_trained_with() -> None:
     values = torch.from_numpy(codes.astype(np.float32) - ZERO).permute(2, 0, 1)[None]
     weight = torch.from_numpy(known.astype(np.float32))[None, None]
     expected, shares = torch_fill(values, weight, FILL_LEVELS)
-    filled, coverage = fill(np.where(known[..., None], codes, np.uint8(0)), known)
+    filled = fill(np.where(known[..., None], codes, np.uint8(0)), known)
     # Two roundings to codes.
     assert (
-        np.abs(filled.astype(np.float32) - ZERO - expected[0].permute(1, 2, 0).numpy()).max()
+        np.abs(filled.values.astype(np.float32) - ZERO - expected[0].permute(1, 2, 0).numpy()).max()
         <= 1.05
     )
     for level, share in enumerate(shares):
-        assert np.abs(coverage[..., level] / 255 - share[0, 0].numpy()).max() < 0.005
+        assert np.abs(filled.coverage[..., level] / 255 - share[0, 0].numpy()).max() < 0.005
+
+
+def test_the_rest_of_a_filled_value_is_grey() -> None:
+    known = np.zeros((128, 128), np.bool_)
+    known[:40] = np.random.default_rng(1).random((40, 128)) > 0.7
+    codes = np.where(known, np.uint8(228), np.uint8(0))[..., None]
+    filled = fill(codes, known)
+    assert (filled.part[known] == 1).all()
+    assert (filled.part[80:] == 0).all()
+    assert ((filled.part > 0.1) & (filled.part < 0.9)).any()
+    expected = ZERO + 100 * filled.part
+    assert np.abs(filled.values[..., 0] - expected).max() <= 1.05
 
 
 def test_painted_pixels_are_evened_as_the_network_was_trained() -> None:

@@ -67,8 +67,8 @@ def test_what_the_source_hides_weighs_more_than_gaps_between_points() -> None:
     codes[:16, :, 1] = 0  # beside the head
     reach = np.full((128, 128), 255, np.uint8)
     reach[:32] = 0
-    lent = np.zeros((64, 64), np.float32)
-    weights = unseen_weights(Placed(codes, np.zeros((128, 128, 4), np.uint8), reach, lent))
+    lent, warped = np.zeros((64, 64), np.float32), np.zeros((128, 128, 4), np.uint8)
+    weights = unseen_weights(Placed(codes, warped, reach, lent, lent))
     assert np.all(weights[44:76, 44:76] == 1 + UNSEEN_WEIGHT)
     assert np.all(weights[:32] == 1)
     assert np.all(weights[96:] == 1)

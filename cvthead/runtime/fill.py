@@ -48,17 +48,21 @@ def fill(values: Codes, known: NDArray[np.bool_]) -> Filled:
         mean: Array = np.asarray(total * share_inverse[..., None], np.float32)
         pulled.append((mean, (count > 0)[..., None]))
     out = np.full_like(mean, ZERO)
-    part = np.zeros(mean.shape[:2], np.float32)
+    part: Array = np.zeros(mean.shape[:2], np.float32)
     for mean, some in reversed(pulled):
         sides = mean.shape[:2]
         coarse = cv2.resize(out, sides, interpolation=cv2.INTER_LINEAR)
         out = np.where(some, mean, coarse.reshape(mean.shape))
-        part = np.where(some[..., 0], 1, cv2.resize(part, sides, interpolation=cv2.INTER_LINEAR))
+        part = np.maximum(_resized(part, sides), some[..., 0].astype(np.float32))
     small = np.rint(out).astype(np.uint8)
     large = cv2.resize(small, (size, size), interpolation=cv2.INTER_LINEAR)
     filled = cv2.copyTo(values, known.view(np.uint8), large.reshape(values.shape))
-    part = cv2.resize(part, (size, size), interpolation=cv2.INTER_LINEAR)
-    return Filled(np.asarray(filled, np.uint8), coverage, np.where(known, np.float32(1), part))
+    part = np.maximum(_resized(part, known.shape), known.astype(np.float32))
+    return Filled(np.asarray(filled, np.uint8), coverage, part)
+
+
+def _resized(part: Array, sides: tuple[int, ...]) -> Array:
+    return np.asarray(cv2.resize(part, sides, interpolation=cv2.INTER_LINEAR), np.float32)
 
 
 def _quarters(a: NDArray[np.uint16]) -> NDArray[np.uint16]:
