@@ -22,6 +22,7 @@ from cvthead.model.config import OPEN
 from cvthead.model.cvthead import CVTHead
 from cvthead.model.splat import splat
 from cvthead.points import PointLayout
+from cvthead.runtime.model_folder import packaged
 from cvthead.training.export import averaged_model, forget_portrait
 from cvthead.training.perceptual import perceptual_weights
 
@@ -52,6 +53,9 @@ def test_one_command_makes_a_model_of_videos(
     training = json.loads((model / "model.json").read_text())["training"]
     assert training["features"] == "transformer"
     assert training["step"] == "1"
+    shipped = json.loads((packaged("open") / "model.json").read_text())
+    assert training["began_with"] == shipped["fingerprint"]
+    assert json.loads(training["settings"])["optimiser"]["learning_rate"] == 1e-4
     assert "licence" not in training  # who fine-tunes knows what the videos allow
 
     avatar, picture = str(tmp_path / "me.avatar"), tmp_path / "me.png"
