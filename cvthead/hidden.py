@@ -3,14 +3,11 @@ the other side of the head, that side's in this one's light."""
 
 from __future__ import annotations
 
-from typing import Any
-
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from cvthead.deformation import to_pixels
+from cvthead.clear import FEWEST, SKIN, looks_like, own_colours
 from cvthead.head.model import Region
 from cvthead.points import PointLayout
 
@@ -20,19 +17,13 @@ Array = NDArray[np.float32]
 # from an ear.
 KINDS = (
     (Region.SCALP,),
-    (Region.FACE, Region.EARS, Region.NECK),
+    SKIN,
     (Region.SHOULDERS,),
     (Region.EYES,),
     (Region.MOUTH,),
 )
 NEAREST = 16  # points that are averaged
-FEWEST = 8  # of a part; if the portrait shows fewer, all parts lend
 CLOSE = 0.01  # normalised distance below which all weigh nearly the same
-# Of the colours of the face, the share that is taken for skin, and how many standard deviations off
-# them skin of ears and neck may be: beyond lie hair, collars and shirts.
-SKIN_SHARE = 0.75
-SKIN_RANGE = 3.0
-SKIN_NOISE = 0.04  # standard deviation that is added, of -1..1
 COVERED = 0.25  # a part of which less than this share looks like skin is covered: scarves, veils
 LIGHT = 0.4  # highest difference between the sides, of -1..1; beyond it is no light, but a shadow
 COVER_REACH = 0.1  # normalised distance, about 2 cm: so far on do hair and collars go on unseen
@@ -52,7 +43,7 @@ def hidden_colours(
         layout: numbering of the points.
         source: (4, S, S) of cvthead.source.network_input.
         points: (P, 3) normalised source projections; distances are taken in all three.
-        clear: (P,) of cvthead.visibility.clear_points.
+        clear: (P,) of cvthead.clear.clear_points.
 
     Returns:
         (P, 3) in -1..1; 0 for points that are clear, and for all if none is.
@@ -115,16 +106,11 @@ def _bare(layout: PointLayout, colours: Array, clear: NDArray[np.bool_]) -> NDAr
     face = colours[own & (region == Region.FACE)]
     if len(face) < FEWEST:
         return out
-    centre = np.median(face, axis=0)
-    off = np.square(face - centre).sum(1)
-    skin = face[off <= np.quantile(off, SKIN_SHARE)] - centre
-    noise = np.eye(3) * SKIN_NOISE**2
-    away = np.linalg.solve(skin.T @ skin / len(skin) + noise, (colours - centre).T)
-    alike = ((colours - centre).T * away).sum(0) <= SKIN_RANGE**2
-    for name in (Region.FACE, Region.EARS, Region.NECK):
+    skin = looks_like(colours, face)
+    for name in SKIN:
         part = own & (region == name)
-        if alike[part].sum() >= COVERED * part.sum():
-            out[:count][part] = alike[part]
+        if skin[part].sum() >= COVERED * part.sum():
+            out[:count][part] = skin[part]
     return out
 
 
@@ -140,16 +126,3 @@ def _mean(
     weight /= weight.sum(1, keepdims=True)
     mean = np.einsum("hk,hkc->hc", weight, values[lenders])
     return mean.astype(np.float32), lenders, distance[:, 0]
-
-
-def own_colours(source: Array, points: Array) -> Array:
-    """(P, 3) in -1..1 where each point lies in the picture; arguments as :func:`hidden_colours`."""
-    image = np.ascontiguousarray(source[:3].transpose(1, 2, 0))
-    return sampled(image, to_pixels(points, len(image)))
-
-
-def sampled(image: NDArray[Any], pixels: NDArray[np.floating]) -> Array:
-    """(S, S, C) at pixel positions (N, 2+), bilinear, the border continued: (N, C) float32."""
-    place = (pixels[:, None, :2] - 0.5).astype(np.float32)
-    found = cv2.remap(image, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
-    return np.asarray(found, np.float32).reshape(len(pixels), -1)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvthead.camera import Camera, Crop
+from cvthead.clear import clear_points
 from cvthead.coefficients import Coefficients
 from cvthead.crop import head_crop
 from cvthead.deformation import Deformation, DeformationModel, points, to_pixels
@@ -18,7 +19,7 @@ from cvthead.hidden import hidden_colours
 from cvthead.points import SEEN, SEEN_MIRRORED, PointLayout
 from cvthead.silhouette import person_mask
 from cvthead.tracking.tracker import TrackedFace, Tracker
-from cvthead.visibility import clear_points, eroded, on_person, visible_points
+from cvthead.visibility import eroded, on_person, visible_points
 
 Array = NDArray[np.float32]
 
@@ -167,6 +168,6 @@ def read_source(
     else:
         mask = eroded(head.mask, 1)
         visible = visible_points(layout, projected, mask, head.camera.scale)
-        clear = clear_points(layout, projected, visible, head.mask)
+        clear = clear_points(layout, network_input(head.image, head.mask), projected, visible)
     drawn = on_person(projected, head.mask)
     return Source(head, deformation, projected, visible, clear, drawn)

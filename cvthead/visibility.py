@@ -23,9 +23,6 @@ DEPTH_TOLERANCE = 0.012
 GRAZING = 0.1
 MASK_LEVEL = 0.5
 MARGIN = 1.0  # pixels
-# Pixels of the 256 x 256 crop beside the outline, where the person is mixed with the background.
-RIM = 4
-EDGE_ON = 0.3  # cosine up to which a colour that is lent is nearer to the true one than the own
 ROUNDS = 2
 UNDECIDED = 0.1  # of the neighbours, more or less than half: the vertex's own answer stays
 
@@ -84,27 +81,6 @@ def inside_mask(points: NDArray[np.float32], mask: NDArray[np.float32]) -> NDArr
     """(P,) whether each projection lies in the frame and on the person."""
     inside, column, row = _pixels(points, mask.shape[0])
     return np.asarray(inside & (mask[row, column] > MASK_LEVEL))
-
-
-def clear_points(
-    layout: PointLayout,
-    points: NDArray[np.float32],
-    visible: NDArray[np.bool_],
-    mask: NDArray[np.float32],
-) -> NDArray[np.bool_]:
-    """Visible points clear of the person's outline and not seen edge-on, so that the colour there
-    is their own: where a cheek turns away, an error of a pixel hits the collar behind it.
-
-    Args:
-        layout, points: as for :func:`visible_points`.
-        visible: (P,).
-        mask: (S, S) person mask of the crop, 0..1.
-
-    Returns:
-        (P,) bool.
-    """
-    inside = inside_mask(points, eroded(mask, RIM))
-    return visible & inside & (towards_camera(layout, points) > EDGE_ON)
 
 
 def on_person(points: NDArray[np.float32], mask: NDArray[np.float32]) -> NDArray[np.bool_]:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from cvthead.clear import FEWEST, clear_points
 from cvthead.head.model import HeadModel, Region
-from cvthead.hidden import FEWEST, hidden_colours
+from cvthead.hidden import hidden_colours
 from cvthead.points import PointLayout
-from cvthead.visibility import clear_points
 
 Array = NDArray[np.float32]
 
@@ -83,7 +83,7 @@ def test_the_rim_of_the_person_lends_no_colour(layout: PointLayout) -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform(-0.48, 0.48, (layout.total, 3)).astype(np.float32)
     visible = rng.random(layout.total) < 0.3
-    clear = clear_points(layout, points, visible, source[3])
+    clear = clear_points(layout, source, points, visible)
     assert 0 < clear.sum() < visible.sum()
     found = hidden_colours(layout, source, points, clear)
     assert (found != 0).any()

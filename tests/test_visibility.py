@@ -8,11 +8,12 @@ import pytest
 from numpy.typing import NDArray
 
 from cvthead import Pipeline
+from cvthead.clear import EDGE_ON
 from cvthead.head.mesh import edges
 from cvthead.head.model import Region
 from cvthead.points import PointLayout
 from cvthead.source import Source
-from cvthead.visibility import EDGE_ON, agreed, towards_camera
+from cvthead.visibility import agreed, towards_camera
 
 
 @pytest.fixture(scope="module")

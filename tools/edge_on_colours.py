@@ -17,12 +17,13 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from cvthead.clear import RIM, own_colours
 from cvthead.evaluation.shots import Shot
 from cvthead.head.model import Region
-from cvthead.hidden import hidden_colours, own_colours
+from cvthead.hidden import hidden_colours
 from cvthead.pipeline import Pipeline
 from cvthead.source import Source, read_source
-from cvthead.visibility import RIM, eroded, inside_mask, towards_camera
+from cvthead.visibility import eroded, inside_mask, towards_camera
 from tools.clips import clip_arguments, clips
 
 Array = NDArray[np.float32]

@@ -16,9 +16,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from cvthead.clear import own_colours
 from cvthead.evaluation.shots import Shot
 from cvthead.head.model import Region
-from cvthead.hidden import hidden_colours, own_colours
+from cvthead.hidden import hidden_colours
 from cvthead.pipeline import Pipeline
 from cvthead.source import Source, read_source
 from tools.clips import clip_arguments, clips

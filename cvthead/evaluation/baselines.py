@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from cvthead.camera import CROP_PIXELS, Camera
+from cvthead.clear import sampled
 from cvthead.coefficients import Coefficients
 from cvthead.deformation import Deformation, points
 from cvthead.evaluation.rasteriser import owners, shade
 from cvthead.head.model import HeadModel
-from cvthead.hidden import sampled
 
 Array = NDArray[np.float32]
 

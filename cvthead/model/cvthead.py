@@ -67,7 +67,7 @@ class CVTHead(nn.Module):
         Args:
             source: (b, 4, 256, 256), RGB in [-1, 1] with 0 outside the person, and the mask.
             points: (b, p, 3) normalised source projections: vertices, midpoints, shell.
-            clear: (b, p) 1 where the source shows the point, see cvthead.visibility.clear_points.
+            clear: (b, p) 1 where the source shows the point, see cvthead.clear.clear_points.
             anchor: (b, shell) vertex that each shell point hangs on.
             hidden: (b, p, 3) of cvthead.hidden; not used by the transformer alone.
 

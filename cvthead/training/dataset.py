@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from cvthead.clear import clear_points
 from cvthead.deformation import MAX_SHELL_POINTS, Deformation
 from cvthead.driving import at_neck
 from cvthead.head.model import HeadModel
@@ -41,7 +42,7 @@ from cvthead.training.details import ZOOMED, detail_weights, unseen_weights, zoo
 from cvthead.training.imagined import imagined, turned
 from cvthead.training.records import Frame, open_records
 from cvthead.training.sampling import group_shares, turned_still
-from cvthead.visibility import clear_points, inside_mask, on_person
+from cvthead.visibility import inside_mask, on_person
 
 Array = NDArray[np.float32]
 
@@ -186,7 +187,7 @@ class PairDataset(Dataset[dict[str, Tensor]]):
             np.maximum(detail_weights(marks, self.size), unseen_weights(each))[None]
             for marks, each in zip(landmarks, placed, strict=True)
         ]
-        clear = clear_points(self.layout, own, visible > 0, network[3])
+        clear = clear_points(self.layout, network, own, visible > 0)
         hidden = hidden_colours(self.layout, network, own, clear)
         if self.all_seen:
             visible, clear = np.ones_like(visible), np.ones_like(clear)

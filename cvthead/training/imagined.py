@@ -12,18 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvthead.camera import Camera
+from cvthead.clear import clear_points, own_colours
 from cvthead.coefficients import Coefficients
 from cvthead.crop import head_crop
 from cvthead.driving import at_neck
 from cvthead.head.model import HeadModel
-from cvthead.hidden import hidden_colours, own_colours
+from cvthead.hidden import hidden_colours
 from cvthead.points import PointLayout
 from cvthead.runtime.fill import ZERO
 from cvthead.runtime.ghosts import point_owners
 from cvthead.runtime.place import SOFT_EDGE, coded, place
 from cvthead.runtime.seams import outline_rim
 from cvthead.source import network_input, places, portrait_pixels
-from cvthead.visibility import clear_points
 
 Array = NDArray[np.float32]
 
@@ -82,7 +82,7 @@ def imagined(
     """
     network = network_input(image, mask)
     at = places(layout, source_points, visible)
-    clear = clear_points(layout, source_points, visible, mask)
+    clear = clear_points(layout, network, source_points, visible)
     hidden = hidden_colours(layout, network, source_points, clear)
     colours = np.where(clear[:, None], own_colours(network, source_points), hidden)
     portrait = portrait_pixels(network)

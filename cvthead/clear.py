@@ -1,0 +1,88 @@
+"""Which visible points have a colour of their own in the portrait.
+
+At the person's outline a pixel is mixed with the background; and where a cheek turns away from the
+camera, an error of a pixel takes the colour of the collar or the wall behind it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cvthead.deformation import to_pixels
+from cvthead.head.model import Region
+from cvthead.points import PointLayout
+from cvthead.visibility import eroded, inside_mask, towards_camera
+
+Array = NDArray[np.float32]
+
+# Pixels of the 256 x 256 crop beside the outline, where the person is mixed with the background.
+RIM = 4
+EDGE_ON = 0.3  # cosine between normal and camera up to which a foreign colour is not believed
+SKIN = (Region.FACE, Region.EARS, Region.NECK)
+FEWEST = 8  # points that tell what skin or hair looks like
+# Of the points of a kind, the share that is taken for typical, and how many standard deviations off
+# them a colour may be.
+TYPICAL = 0.75
+RANGE = 3.0
+NOISE = 0.04  # standard deviation that is added, of -1..1
+
+
+def clear_points(
+    layout: PointLayout, source: Array, points: Array, visible: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Visible points whose colour in the portrait is their own.
+
+    Not those at the person's outline; nor those of face, ears and neck that are seen edge-on and
+    look neither like the skin nor like the hair of this person.
+
+    Args:
+        layout: numbering of the points.
+        source: (4, S, S) of cvthead.source.network_input.
+        points: (P, 3) normalised projections.
+        visible: (P,) of cvthead.visibility.visible_points.
+
+    Returns:
+        (P,) bool.
+    """
+    out = visible & inside_mask(points, eroded(source[3], RIM))
+    edge_on = towards_camera(layout, points) <= EDGE_ON
+    edge_on[: layout.surface] &= np.isin(layout.region, SKIN)
+    edge_on[layout.surface :] = False
+    doubtful = np.flatnonzero(out & edge_on)
+    sure = out & ~edge_on
+    hair = sure.copy()
+    hair[: layout.surface] &= layout.region == Region.SCALP
+    skin = np.flatnonzero(sure[: layout.surface] & (layout.region == Region.FACE))
+    if len(doubtful) and len(skin) >= FEWEST and hair.sum() >= FEWEST:
+        colours = own_colours(source, points)
+        own = looks_like(colours[doubtful], colours[skin])
+        own |= looks_like(colours[doubtful], colours[hair])
+        out[doubtful] = own
+    return out
+
+
+def looks_like(colours: Array, kind: Array) -> NDArray[np.bool_]:
+    """(N,) whether colours (N, 3) look like those of a kind (K, 3), most of which are typical."""
+    centre = np.median(kind, axis=0)
+    off = np.square(kind - centre).sum(1)
+    typical = kind[off <= np.quantile(off, TYPICAL)] - centre
+    spread = typical.T @ typical / len(typical) + np.eye(3) * NOISE**2
+    away = np.linalg.solve(spread, (colours - centre).T)
+    return np.asarray(((colours - centre).T * away).sum(0) <= RANGE**2)
+
+
+def own_colours(source: Array, points: Array) -> Array:
+    """(P, 3) in -1..1 where each point (P, 3) lies in the picture (4, S, S)."""
+    image = np.ascontiguousarray(source[:3].transpose(1, 2, 0))
+    return sampled(image, to_pixels(points, len(image)))
+
+
+def sampled(image: NDArray[Any], pixels: NDArray[np.floating]) -> Array:
+    """(S, S, C) at pixel positions (N, 2+), bilinear, the border continued: (N, C) float32."""
+    place = (pixels[:, None, :2] - 0.5).astype(np.float32)
+    found = cv2.remap(image, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+    return np.asarray(found, np.float32).reshape(len(pixels), -1)
