@@ -48,21 +48,39 @@ def clear_points(
     Returns:
         (P,) bool.
     """
-    out = visible & inside_mask(points, eroded(source[3], RIM))
+    out, doubtful = doubtful_points(layout, source, points, visible)
+    if doubtful.any():
+        skin, hair = looks(layout, own_colours(source, points), out)
+        out |= doubtful & (skin | hair)
+    return out
+
+
+def doubtful_points(
+    layout: PointLayout, source: Array, points: Array, visible: NDArray[np.bool_]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Of the points that are not at the outline, those whose colour is surely their own, and those
+    of face, ears and neck that are seen edge-on, (P,) each; arguments as :func:`clear_points`."""
+    inside = visible & inside_mask(points, eroded(source[3], RIM))
     edge_on = towards_camera(layout, points) <= EDGE_ON
     edge_on[: layout.surface] &= np.isin(layout.region, SKIN)
     edge_on[layout.surface :] = False
-    doubtful = np.flatnonzero(out & edge_on)
-    sure = out & ~edge_on
-    hair = sure.copy()
-    hair[: layout.surface] &= layout.region == Region.SCALP
-    skin = np.flatnonzero(sure[: layout.surface] & (layout.region == Region.FACE))
-    if len(doubtful) and len(skin) >= FEWEST and hair.sum() >= FEWEST:
-        colours = own_colours(source, points)
-        own = looks_like(colours[doubtful], colours[skin])
-        own |= looks_like(colours[doubtful], colours[hair])
-        out[doubtful] = own
-    return out
+    return inside & ~edge_on, inside & edge_on
+
+
+def looks(
+    layout: PointLayout, colours: Array, sure: NDArray[np.bool_]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """(P,) whether each colour (P, 3) looks like this person's skin, and like their hair, told by
+    the points whose colour is surely their own; all do if there are hardly any."""
+    surface = np.zeros_like(sure)
+    surface[: layout.surface] = layout.region == Region.FACE
+    hair = ~surface
+    hair[: layout.surface] = layout.region == Region.SCALP
+    kinds = [colours[sure & kind] for kind in (surface, hair)]
+    if min(len(kind) for kind in kinds) < FEWEST:
+        return np.ones_like(sure), np.ones_like(sure)
+    skin, other = (looks_like(colours, kind) for kind in kinds)
+    return skin, other
 
 
 def looks_like(colours: Array, kind: Array) -> NDArray[np.bool_]:

@@ -8,12 +8,11 @@ import pytest
 from numpy.typing import NDArray
 
 from cvthead import Pipeline
-from cvthead.clear import EDGE_ON
 from cvthead.head.mesh import edges
 from cvthead.head.model import Region
 from cvthead.points import PointLayout
 from cvthead.source import Source
-from cvthead.visibility import agreed, towards_camera
+from cvthead.visibility import agreed
 
 
 @pytest.fixture(scope="module")
@@ -74,15 +73,3 @@ def test_a_portrait_sees_the_face_and_not_the_back_of_the_head(
     assert back.any()
     assert own[back].mean() < 0.1
     assert lonely(head.faces, own) < 10
-
-
-def test_no_colour_is_taken_where_the_face_is_seen_edge_on(
-    pipeline: Pipeline, source: Source
-) -> None:
-    layout = pipeline.layout
-    towards = towards_camera(layout, source.points)
-    face = np.flatnonzero(layout.region == Region.FACE)
-    edge_on = face[source.visible[face] & (towards[face] < EDGE_ON)]
-    assert len(edge_on) > 20
-    assert not source.clear[edge_on].any()
-    assert source.clear[face[towards[face] > 0.9]].mean() > 0.9
