@@ -23,7 +23,7 @@ Array = NDArray[np.float32]
 RIM = 4
 EDGE_ON = 0.3  # cosine between normal and camera up to which a foreign colour is not believed
 SKIN = (Region.FACE, Region.EARS, Region.NECK)
-FEWEST = 8  # points that tell what skin or hair looks like
+FEWEST = 8  # points that tell what a part, skin or hair looks like
 # Of the points of a kind, the share that is taken for typical, and how many standard deviations off
 # them a colour may be.
 TYPICAL = 0.75
@@ -50,7 +50,7 @@ def clear_points(
     """
     out, doubtful = doubtful_points(layout, source, points, visible)
     if doubtful.any():
-        skin, hair = looks(layout, own_colours(source, points), out)
+        skin, hair = like_skin_and_hair(layout, own_colours(source, points), out)
         out |= doubtful & (skin | hair)
     return out
 
@@ -67,20 +67,18 @@ def doubtful_points(
     return inside & ~edge_on, inside & edge_on
 
 
-def looks(
+def like_skin_and_hair(
     layout: PointLayout, colours: Array, sure: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """(P,) whether each colour (P, 3) looks like this person's skin, and like their hair, told by
     the points whose colour is surely their own; all do if there are hardly any."""
-    surface = np.zeros_like(sure)
-    surface[: layout.surface] = layout.region == Region.FACE
-    hair = ~surface
+    face, hair = np.zeros_like(sure), np.ones_like(sure)  # the shell is hair
+    face[: layout.surface] = layout.region == Region.FACE
     hair[: layout.surface] = layout.region == Region.SCALP
-    kinds = [colours[sure & kind] for kind in (surface, hair)]
-    if min(len(kind) for kind in kinds) < FEWEST:
+    skin, hair = sure & face, sure & hair
+    if min(skin.sum(), hair.sum()) < FEWEST:
         return np.ones_like(sure), np.ones_like(sure)
-    skin, other = (looks_like(colours, kind) for kind in kinds)
-    return skin, other
+    return looks_like(colours, colours[skin]), looks_like(colours, colours[hair])
 
 
 def looks_like(colours: Array, kind: Array) -> NDArray[np.bool_]:

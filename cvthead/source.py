@@ -47,6 +47,11 @@ class HeadCrop:
     camera: Camera
     coefficients: Coefficients
 
+    @cached_property
+    def network_input(self) -> Array:
+        """(4, 256, 256): RGB in [-1, 1], 0 outside the person, and the mask."""
+        return network_input(self.image, self.mask)
+
 
 @dataclass(frozen=True, eq=False)
 class Source:
@@ -57,7 +62,7 @@ class Source:
         deformation: hair and shoulders in rest space.
         points: (P, 3) normalised projections, numbered by the PointLayout.
         visible: (P,) bool, which of them the portrait sees.
-        clear: (P,) bool, which of those have their own colour, see cvthead.visibility.
+        clear: (P,) bool, which of those have their own colour, see cvthead.clear.
         drawn: (P,) bool, which of them are part of the avatar; the others lie beyond the
             picture's edge, or beside the person.
     """
@@ -77,10 +82,10 @@ class Source:
         """(P, 3) colours of the points that the portrait hides, see cvthead.hidden."""
         return hidden_colours(layout, self.network_input, self.points, self.clear)
 
-    @cached_property
+    @property
     def network_input(self) -> Array:
-        """(4, 256, 256): RGB in [-1, 1], 0 outside the person, and the mask."""
-        return network_input(self.head.image, self.head.mask)
+        """That of the crop."""
+        return self.head.network_input
 
 
 def places(layout: PointLayout, points: Array, visible: NDArray[np.bool_]) -> Array:
@@ -168,6 +173,6 @@ def read_source(
     else:
         mask = eroded(head.mask, 1)
         visible = visible_points(layout, projected, mask, head.camera.scale)
-        clear = clear_points(layout, network_input(head.image, head.mask), projected, visible)
+        clear = clear_points(layout, head.network_input, projected, visible)
     drawn = on_person(projected, head.mask)
     return Source(head, deformation, projected, visible, clear, drawn)

@@ -56,6 +56,7 @@ def assert_a_break_changed_nothing(run: Path, *, adversary: bool) -> None:
         for kind in ("whole", "broken")
     )
     assert whole["step"] == broken["step"] == 2
+    assert whole["began_with"] == broken["began_with"] == "random weights"
     assert whole.keys() == broken.keys()
     assert ("discriminator_optimizer" in whole) == adversary
     for part in whole.keys() - {"config"}:

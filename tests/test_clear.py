@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from cvthead import Pipeline
 from cvthead.clear import clear_points, doubtful_points, looks_like, own_colours
+from cvthead.deformation import to_pixels
 from cvthead.head.model import Region
 from cvthead.source import Source
 
@@ -35,8 +36,7 @@ def test_what_is_seen_edge_on_must_look_like_the_person(
     sure, doubtful = doubtful_points(layout, image, *given)
     assert doubtful.sum() > 100
     wanted = typical(pipeline, source, colour) if isinstance(colour, Region) else colour
-    size = image.shape[-1]
-    column, row = np.floor((source.points[doubtful, :2].T + 1) / 2 * size).astype(int)
+    column, row = to_pixels(source.points[doubtful], image.shape[-1])[:, :2].astype(int).T
     for down in (-1, 0, 1):
         for right in (-1, 0, 1):
             image[:3, row + down, column + right] = np.array(wanted, np.float32)[:, None]

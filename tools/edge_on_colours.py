@@ -16,7 +16,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from cvthead.clear import EDGE_ON, SKIN, doubtful_points, looks, own_colours
+from cvthead.clear import EDGE_ON, SKIN, doubtful_points, like_skin_and_hair, own_colours
 from cvthead.evaluation.shots import Shot
 from cvthead.hidden import hidden_colours
 from cvthead.pipeline import Pipeline
@@ -38,7 +38,7 @@ def compared(
     given = layout, source.network_input, source.points
     sure, doubtful = doubtful_points(*given, source.visible)
     colours = own_colours(*given[1:])
-    skin, hair = looks(layout, colours, sure)
+    skin, hair = like_skin_and_hair(layout, colours, sure)
     lent = hidden_colours(*given, sure)[:count]
     kinds = {"skin": skin, "hair": hair & ~skin, "neither": ~skin & ~hair}
     for driver in drivers:

@@ -23,6 +23,7 @@ from cvthead.training.config import IMPORTED, SHIPPED, TrainConfig
 from cvthead.training.discriminator import MultiScaleDiscriminator
 
 OPEN_PRESET = "open"
+UNKNOWN = "unknown"  # what checkpoints of earlier versions do not tell
 NOT_A_CHECKPOINT = "give a run's checkpoint.pt"
 ANOTHER_NETWORK = "preset and weights must belong together"
 
@@ -39,7 +40,7 @@ class RunState:
         step: steps done.
         running: smoothed losses of this process's batches.
         best: lowest ST-LPIPS on the validation records so far.
-        began_with: fingerprint of the weights that the run started from; empty: random ones.
+        began_with: fingerprint of the weights that the run started from, or what they were.
     """
 
     model: nn.Module
@@ -50,7 +51,7 @@ class RunState:
     step: int = 0
     running: dict[str, float] = field(default_factory=dict)
     best: float = math.inf
-    began_with: str = ""
+    began_with: str = "random weights"
 
     def parts(self) -> dict[str, Any]:
         """By name, those with a state_dict."""
@@ -120,7 +121,7 @@ def resume(path: Path, fabric: Fabric, config: TrainConfig, state: RunState) -> 
     state.step, state.running = contents["step"], contents["running"]
     # Absent from checkpoints of earlier versions.
     state.best = contents.get("best", math.inf)
-    state.began_with = contents.get("began_with", "")
+    state.began_with = contents.get("began_with", UNKNOWN)
 
 
 def start_from(config: TrainConfig, state: RunState) -> None:

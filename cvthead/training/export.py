@@ -42,7 +42,7 @@ from cvthead.runtime.networks import DESCRIBE_INPUTS
 from cvthead.runtime.place import Placed, place
 from cvthead.runtime.seams import outline_rim
 from cvthead.source import portrait_pixels
-from cvthead.training.checkpoint import averaged, read
+from cvthead.training.checkpoint import UNKNOWN, averaged, read
 from cvthead.training.dataset import PairDataset
 from cvthead.training.onnx_export import export_describe, export_paint
 from cvthead.training.quantise import feed, quantise
@@ -172,8 +172,8 @@ def export(
     deform = config.get("deformation", True)
     training = {
         "step": str(state["step"]),
-        "seed": str(config.get("seed", "unknown")),
-        "began_with": state.get("began_with") or "random weights",
+        "seed": str(config.get("seed", UNKNOWN)),
+        "began_with": state.get("began_with", UNKNOWN),
         "settings": json.dumps({name: config[name] for name in sorted(config.keys() - PATHS)}),
         "features": model.config.features,
         "deformation": str(deform).lower(),

@@ -21,7 +21,7 @@ from cvthead.hidden import hidden_colours
 from cvthead.points import PointLayout
 from cvthead.runtime.fill import ZERO
 from cvthead.runtime.ghosts import point_owners
-from cvthead.runtime.place import SOFT_EDGE, coded, place
+from cvthead.runtime.place import COLOURS, SOFT_EDGE, coded, place
 from cvthead.runtime.seams import outline_rim
 from cvthead.source import network_input, places, portrait_pixels
 
@@ -88,7 +88,7 @@ def imagined(
     portrait = portrait_pixels(network)
     owners, rim = point_owners(at, visible), outline_rim(portrait)
     placed = place(layout, points, at, owners, rim, coded(colours, 1), portrait, size // 2)
-    colour = cv2.medianBlur(np.ascontiguousarray(placed.codes[..., 1:4]), SPECKLED)
+    colour = cv2.medianBlur(np.ascontiguousarray(placed.codes[..., COLOURS]), SPECKLED)
     painted = cv2.resize(colour, (size, size), interpolation=cv2.INTER_LINEAR)
     carried = cv2.extractChannel(placed.warped, 3)
     # As far as points lie or the portrait shows the person, without the margin that a frame has.
