@@ -120,7 +120,9 @@ def _mean(
     """Values (P, 3) around the hidden points, of those that are shown: (H, 3); (H, k) which ones
     lend, and (H,) how far the nearest is."""
     count = min(NEAREST, len(shown))
-    distance, number = cKDTree(points[shown]).query(points[hidden], count)
+    # Each tree is asked once: a balanced one takes longer to build than it saves.
+    tree = cKDTree(points[shown], compact_nodes=False, balanced_tree=False)
+    distance, number = tree.query(points[hidden], count)
     distance, lenders = distance.reshape(-1, count), shown[number.reshape(-1, count)]
     weight = (distance + CLOSE) ** -2
     weight /= weight.sum(1, keepdims=True)

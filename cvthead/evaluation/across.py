@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from cvthead.evaluation.clip import LENT, Bench, Clip
 from cvthead.evaluation.cross_identity import (
@@ -56,7 +57,8 @@ def crossings(bench: Bench, clips: Sequence[Clip], each: int, csim: Embed | None
     """
     lent = [shot for clip in clips for shot in clip.lent]
     done = []
-    for number, other in pairs([clip.identity for clip in clips], LENT, each):
+    crossed = pairs([clip.identity for clip in clips], LENT, each)
+    for number, other in tqdm(crossed, desc="other drivers", unit="pair"):
         clip, driver = clips[number], lent[other]
         found, drawn = cross(
             bench.tracker, bench.embed, clip.source, clip.known, clip.persons, driver
@@ -126,7 +128,7 @@ def cross_tables(
 def turns(bench: Bench, clips: Sequence[Clip]) -> tuple[list[dict[str, Found | None]], list[Grid]]:
     """Every source turned to either side."""
     found, grids = [], []
-    for clip in clips:
+    for clip in tqdm(clips, desc="turned heads", unit="clip"):
         views, drawn = turn(bench.tracker, bench.embed, clip.source, clip.known, clip.persons)
         found += views
         rows = {

@@ -103,7 +103,9 @@ class TrainConfig(Section):
             network is trained as it will be run; 1 never.
         average: decay of the averaged weights that are exported.
         seed: of weights and samples.
-        workers: processes that load samples, for each training process.
+        workers: processes that load samples, for each training process; 0: that process itself.
+            By default one where there are more than two cores: on two, it would take turns with
+            the networks' threads, which wait for one another.
         log_every, save_every: steps between log lines and between checkpoints.
     """
 
@@ -125,7 +127,7 @@ class TrainConfig(Section):
     freeze_norm: float = Field(default=1.0, ge=0, le=1)
     average: float = Field(default=0.0, ge=0, lt=1)
     seed: int = Field(default=0, ge=0)
-    workers: int = Field(default=1, ge=0)
+    workers: int | None = Field(default=None, ge=0)
     log_every: int = Field(default=50, ge=1)
     save_every: int = Field(default=150, ge=1)
     losses: LossWeights = LossWeights()

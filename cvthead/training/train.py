@@ -215,13 +215,14 @@ def batches(
     numbers = [
         step * config.batch + start + each for step in range(first, last) for each in range(share)
     ]
+    workers = int(cores() > 2) if config.workers is None else config.workers
     loader = DataLoader(
         Subset(dataset, numbers),
         share,
-        num_workers=config.workers,
+        num_workers=workers,
         # A forked worker hangs when OpenCV had threads in this process.
-        multiprocessing_context="spawn" if config.workers else None,
-        prefetch_factor=4 if config.workers else None,
+        multiprocessing_context="spawn" if workers else None,
+        prefetch_factor=4 if workers else None,
     )
     for batch in loader:
         yield {name: value.to(fabric.device) for name, value in batch.items()}
