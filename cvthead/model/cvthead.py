@@ -125,9 +125,7 @@ class CVTHead(nn.Module):
         image = splat(points, values, warped.shape[-1] // self.config.unet_unshuffle)
         with torch.autocast(image.device.type, enabled=False):
             filled = self.filled(image)
-        out: tuple[Tensor, Tensor] = self.unet(
-            filled.contiguous(memory_format=torch.channels_last), warped, carry=carry
-        )
+        out: tuple[Tensor, Tensor] = self.unet(filled, warped, carry=carry)
         return out
 
     def filled(self, image: Tensor) -> Tensor:

@@ -62,7 +62,8 @@ def train(config: TrainConfig, *, sitting: int | None = None) -> Path:
     torch.manual_seed(config.seed)
     dataset, renderer = training_parts(config)
     objective = Objective(config).to(fabric.device)
-    renderer.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    if half_precision(fabric, config):  # in float32 the gradients of convolutions take longer so
+        renderer.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     discriminator = MultiScaleDiscriminator() if config.stage == 2 else None
     # Wrapped for the distributed forward pass; the state keeps the plain networks.
     wrapped, optimiser = fabric.setup(renderer, new_optimiser(config, renderer))
@@ -175,10 +176,16 @@ def autocast(fabric: Fabric, config: TrainConfig) -> torch.autocast:
     Fabric's own would round their inputs as well, and with them the points: in bfloat16 a point
     near the edge lies up to half a pixel off.
     """
-    half = config.precision == "bf16-mixed" or (
+    return torch.autocast(
+        fabric.device.type, torch.bfloat16, enabled=half_precision(fabric, config)
+    )
+
+
+def half_precision(fabric: Fabric, config: TrainConfig) -> bool:
+    """Whether the networks compute in bfloat16."""
+    return config.precision == "bf16-mixed" or (
         config.precision == "auto" and computes_bfloat16(fabric.device)
     )
-    return torch.autocast(fabric.device.type, torch.bfloat16, enabled=half)
 
 
 def computes_bfloat16(device: torch.device) -> bool:
