@@ -25,6 +25,9 @@ Array = NDArray[np.float32]
 
 # 12 pixels to each side, as wide as loose hair. What is faintly segmented farther off is no person.
 SOFT_EDGE = np.ones((25, 25), np.uint8)
+# A probability is no coverage. Where the segmentation doubts whole regions beside the person, they
+# would show as fog; what is this near to 0 or 1 counts as decided.
+DECIDED = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +132,8 @@ def cut_head(
     vertices = tracker.head.vertices(face.coefficients)[tracker.head.region == Region.FACE]
     kept = person_mask(probability, valid, to_pixels(camera.project(vertices)))
     near = cv2.dilate(kept.astype(np.uint8), SOFT_EDGE) > 0
-    mask = np.where(kept | (near & (probability < 0.5)), probability, 0) * valid
+    coverage = np.clip((probability - DECIDED) / (1 - 2 * DECIDED), 0, 1)
+    mask = np.where(kept | (near & (probability < 0.5)), coverage, 0) * valid
     return HeadCrop(pixels, mask.astype(np.float32), valid, crop, camera, face.coefficients)
 
 

@@ -22,6 +22,7 @@ from cvthead.composite import Composer
 from cvthead.errors import AvatarFileError, CoefficientsError, ModelChangedError, NoFaceError
 from cvthead.images import read_image
 from cvthead.runtime.model_folder import RECORD, packaged
+from cvthead.source import cut_head
 
 PORTRAIT = Path(__file__).parents[1] / "examples" / "astronaut.png"
 TURN = 0.35  # radians
@@ -203,6 +204,20 @@ def test_what_the_portrait_cuts_off_is_not_drawn(
     below = slice(round(256 * (chin + 12 - cut.crop.top) / cut.crop.size), None)
     assert pipeline.render(cut).alpha[below].mean() < 12
     assert pipeline.render(whole).alpha[below].mean() > 128
+
+
+def test_what_is_nearly_sure_to_be_person_or_background_is_no_fog(
+    pipeline: Pipeline, portrait: NDArray[np.uint8]
+) -> None:
+    head = cut_head(pipeline.tracker, portrait, pipeline.tracker.track(portrait))
+    probability = pipeline.tracker.networks.person_mask(head.image)
+    assert (head.mask[probability < 0.24] == 0).all()
+    sure = head.mask[(probability > 0.76) & head.valid]
+    assert np.isin(sure, (0, 1)).all()  # 0 for somebody else
+    assert sure.mean() > 0.9
+    unsure = (np.abs(probability - 0.5) < 0.2) & (head.mask > 0)
+    assert unsure.any()
+    np.testing.assert_array_equal(head.mask[unsure] > 0.5, probability[unsure] > 0.5)
 
 
 def test_alpha_and_background(pipeline: Pipeline, avatar: AvatarType) -> None:
