@@ -325,6 +325,8 @@ def test_shipped_configurations_are_valid() -> None:
     assert fine.init == "shipped"
     assert fine.data == Path("d")
     assert load_config("open.toml", {}).optimiser.betas == (0.9, 0.99)
+    parts = [load_config(name, {}) for name in ("open-coarse", "open", "open-fine")]
+    assert [(part.size, part.seed) for part in parts] == [(128, 0), (256, 0), (256, 1)]
     for name, stage, adversarial in (("paper", 1, 0), ("paper-stage2", 2, 0.1)):
         paper = load_config(name, {})
         assert (paper.preset, paper.batch, paper.stage) == ("paper", 16, stage)

@@ -28,7 +28,8 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument(
         "config",
         metavar="CONFIG",
-        help="TOML file, or a shipped one: open-coarse, open, finetune, paper, paper-stage2",
+        help="TOML file, or a shipped one: open-coarse, open, open-fine, finetune, paper, "
+        "paper-stage2",
     )
     parser.add_argument("--data", type=Path, metavar="FOLDER", help="instead of the file's")
     parser.add_argument(
