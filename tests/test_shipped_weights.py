@@ -8,15 +8,14 @@ from typing import Any
 
 import pytest
 
-import cvthead
+from cvthead.runtime.model_folder import packaged
 
 ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
 def record() -> dict[str, Any]:
-    assets = Path(cvthead.__file__).parent / "assets/open"
-    loaded: dict[str, Any] = json.loads((assets / "model.json").read_text())
+    loaded: dict[str, Any] = json.loads((packaged("open") / "model.json").read_text())
     return loaded
 
 
